@@ -1,0 +1,143 @@
+"""A Gymnasium environment as a managed system, unmodified."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from adapters.systems.state_index import state_index
+from managed_systems import register_envs
+from mape.config import SystemConfig
+from mape.errors import ConfigError, ManagedSystemError, UnknownName
+from mape.ports import Episode, StepRules
+
+
+def make_system(config: SystemConfig) -> GymnasiumSystem:
+    """Make the environment that a config names.
+
+    Raises
+    ------
+    ConfigError
+        There is no such environment, it refuses its options, or it is no table of states and actions.
+    """
+    register_envs()
+    try:
+        # Gymnasium's passive checker warns on every reset that an unusual environment makes; `mapek check` does it once.
+        env = gymnasium.make(config.id, disable_env_checker=True, **config.options)
+    except gymnasium.error.NameNotFound:
+        raise UnknownName(
+            "system", config.id, gymnasium.registry, "Any registered Gymnasium id serves; see `mapek list`."
+        ) from None
+    except gymnasium.error.Error as error:
+        raise ConfigError(f"system {config.id!r}: {error}") from None
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"system {config.id!r} needs the module {error.name!r}, which is not installed") from error
+    except Exception as error:
+        raise ConfigError(f"system {config.id!r} with options {config.options}: {error}") from error
+    return GymnasiumSystem(env, config)
+
+
+class GymnasiumSystem:
+    """The managed-system port over one environment.
+
+    Parameters
+    ----------
+    env
+        A Gymnasium environment with discrete actions.
+    config
+        How it is seen: step cap, discretiser.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], config: SystemConfig) -> None:
+        self.env = env
+        self.name = config.id
+        self._base: Any = env.unwrapped
+        if not isinstance(env.action_space, spaces.Discrete):
+            raise ConfigError(f"{self.name} has actions {env.action_space}; the loop needs Discrete actions")
+        if env.action_space.n < 1:
+            raise ConfigError(f"{self.name} has no action; a managed system has at least one")
+        self.n_states, self._index = state_index(env.observation_space, config.discretise, self.name)
+        rules = getattr(self._base, "rules", None)
+        self.rules: StepRules | None = rules
+        spec_cap = env.spec.max_episode_steps if env.spec is not None else None
+        caps = [cap for cap in (config.max_steps, getattr(rules, "max_steps", None), spec_cap) if cap is not None]
+        if not caps:
+            raise ConfigError(
+                f"{self.name} has no step cap of its own, and an episode must end; set system.max_steps, such as 200"
+            )
+        self.max_steps = int(min(caps))
+        self.signal_names: tuple[str, ...] = tuple(getattr(rules, "signal_names", getattr(self._base, "signal_names", ())))
+        self.drifts: tuple[int, ...] = tuple(getattr(rules, "drifts", getattr(self._base, "drifts", ())))
+        self.draws: tuple[int, int] = (rules.reset_draws, rules.step_draws) if rules is not None else (0, 0)
+        self.first_state = 0
+        self._mask: npt.NDArray[np.int8] | None = None
+        self._windows: tuple[int, int, tuple[int, ...]] | None = None
+
+    def available(self, episode: int) -> tuple[int, ...] | None:
+        """Return the actions of episode `episode` from the rules' windows, or None where only a reset can tell."""
+        if self.rules is None:
+            return None
+        if self._windows is None or not self._windows[0] <= episode < self._windows[1]:
+            first, last = self.rules.windows.T
+            here = tuple(np.flatnonzero((first <= episode) & (episode <= last)).tolist())
+            edges = [e for e in (*first.tolist(), *(last + 1).tolist()) if e > episode]
+            begun = max([0, *(e for e in (*first.tolist(), *(last + 1).tolist()) if e <= episode)])
+            self._windows = (begun, min(edges, default=2**63), here)
+        return self._windows[2]
+
+    def begin(self, episode: Episode) -> tuple[int, tuple[int, ...]]:
+        """Reset the environment for an episode; return the first state and the available actions."""
+        options: dict[str, Any] = {"episode": episode.number}
+        if self.rules is not None:
+            options["uniforms"] = episode.uniforms
+        seen, info = self.env.reset(seed=episode.seed, options=options)
+        self._see_mask(info)
+        self.first_state = self._index(seen)
+        if "available_actions" in info:
+            return self.first_state, tuple(int(action) for action in info["available_actions"])
+        # Asked each time: an environment may reassign its action space.
+        space: Any = self.env.action_space
+        return self.first_state, tuple(range(int(space.start), int(space.start + space.n)))
+
+    def step(self, action: int, context: npt.NDArray[np.float64]) -> tuple[int, float, bool, bool]:
+        """Act; return next state, reward, terminated, truncated."""
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        self._see_mask(info)
+        if self.signal_names:
+            signals = info.get("signals", {})
+            for k, name in enumerate(self.signal_names):
+                if name not in signals:
+                    raise ManagedSystemError(
+                        f"{self.name} declares signal {name!r} and did not put it into info['signals']; got "
+                        f"{', '.join(signals) or 'none'}"
+                    )
+                context[k] += float(signals[name])
+        return self._index(seen), float(reward), bool(terminated), bool(truncated)
+
+    def explorable(self, action: int) -> bool:
+        """Look the action up in the present state's ``info["action_mask"]``; without one, all may be tried."""
+        return self._mask is None or bool(self._mask[action])
+
+    def enable(self, actions: tuple[int, ...]) -> None:
+        """Switch reserve actions on.
+
+        Raises
+        ------
+        ValueError
+            The environment has no reserve, or not these.
+        """
+        if not hasattr(self._base, "enable_actions"):
+            raise ValueError(f"{self.name} has no actions in reserve (no enable_actions), so {actions} cannot be enabled")
+        self._base.enable_actions(actions)
+        self._windows = None
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def _see_mask(self, info: dict[str, Any]) -> None:
+        self._mask = info.get("action_mask")

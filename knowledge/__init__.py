@@ -1,0 +1,40 @@
+"""Knowledge: the records, their log, the Q-table, and what the stages share. Imports nothing of ours."""
+
+from knowledge.log import Ack, Log, Pass
+from knowledge.q_table import QTable
+from knowledge.records import (
+    STAGES,
+    ChangePlan,
+    ChangeRequest,
+    Drift,
+    MalformedRecord,
+    Observation,
+    Reading,
+    Record,
+    Symptom,
+    from_json,
+    to_json,
+)
+from knowledge.rows import RowLayout, actions_of
+from knowledge.store import Knowledge
+
+__all__ = [
+    "STAGES",
+    "Ack",
+    "ChangePlan",
+    "ChangeRequest",
+    "Drift",
+    "Knowledge",
+    "Log",
+    "MalformedRecord",
+    "Observation",
+    "Pass",
+    "QTable",
+    "Reading",
+    "Record",
+    "RowLayout",
+    "Symptom",
+    "actions_of",
+    "from_json",
+    "to_json",
+]

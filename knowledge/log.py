@@ -1,0 +1,202 @@
+"""The sequenced log of one loop: every record of every pass, in order, once."""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from knowledge.records import STAGES, ChangePlan, ChangeRequest, Observation, Record, Symptom
+from knowledge.rows import RowLayout
+
+_new = tuple.__new__
+
+SEGMENT = 512
+"""Rows that are packed before they are hashed and handed on together."""
+
+
+class Ack(enum.Enum):
+    """What became of a record that was sent to the log."""
+
+    OK = "ok"
+    DUPLICATE = "duplicate"
+    GAP = "gap"
+    CONFLICT = "conflict"
+
+
+_OK = Ack.OK  # an enum's member costs a call to look up
+
+
+class Pass(NamedTuple):
+    """The four records of a finished pass."""
+
+    observation: Observation
+    symptom: Symptom
+    request: ChangeRequest
+    plan: ChangePlan
+
+
+class Log:
+    """Append-only log of one loop, idempotent by (stage, pass), with a running hash.
+
+    `append` answers
+
+    - ``OK``: the record was the next one, and is now part of the log;
+    - ``DUPLICATE``: it was there already. A record older than the window is answered so without a comparison;
+    - ``GAP``: records before it are missing; nothing was changed;
+    - ``CONFLICT``: another record has its place, or it hands on other signals or action sets than it was given;
+      nothing was changed.
+
+    Parameters
+    ----------
+    layout
+        Layout of the run's rows.
+    loop
+        Number of the loop whose records are taken.
+    window
+        Number of finished passes that stay readable.
+
+    Examples
+    --------
+    >>> log = Log(RowLayout(("return",), detectors=0, rates=1))
+    >>> log.append(ChangePlan(0, 0, 1.0, (0.1,), (0, 1), (), (), False, None))
+    <Ack.OK: 'ok'>
+    >>> log.append(ChangePlan(0, 3, 1.0, (0.1,), (), (), (), False, None))
+    <Ack.GAP: 'gap'>
+    """
+
+    def __init__(self, layout: RowLayout, loop: int = 0, window: int = 256) -> None:
+        self.layout = layout
+        self.loop = loop
+        self.passes = 0  # finished passes
+        self.window: deque[Pass] = deque(maxlen=window)
+        self._start: ChangePlan | None = None
+        self._open: list[Any] = []  # the records of the pass that is being logged
+        self._number = -1  # the pass whose record is expected next; none before plan 0
+        self._expected: type[Record] = Observation
+        self._row_size = layout.struct.size
+        self._buffer = bytearray(layout.struct.size * SEGMENT)
+        self._filled = 0  # bytes of the buffer in use
+        self._hash = hashlib.sha256(layout.schema)
+        self._listeners: list[Callable[[npt.NDArray[np.void]], object]] = []
+
+    def on_rows(self, listener: Callable[[npt.NDArray[np.void]], object]) -> None:
+        """Hand each segment of finished rows to `listener`, as a structured array that is valid during the call."""
+        self._listeners.append(listener)
+
+    def append(self, record: Record) -> Ack:
+        """Take `record` if it is the next one; see the class for the answers.
+
+        Raises
+        ------
+        ValueError
+            The record does not fit the run's layout.
+        """
+        kind = type(record)
+        if kind is not self._expected or record[1] != self._number or record[0] != self.loop:
+            return self._unexpected(record)
+        if kind is ChangePlan:
+            self._finish(record)
+            return _OK
+        if kind is Observation:
+            self._open = [record]
+            self._expected = Symptom
+            return _OK
+        # A stage hands on what it was given; within a process these are the very objects, so identity comes first.
+        seen: Any = self._open[0]
+        signals = record[2] if kind is Symptom else record[5]
+        if signals is not seen[8] and signals != seen[8]:
+            return Ack.CONFLICT
+        if kind is Symptom:
+            if (record[3] is not seen[6] and record[3] != seen[6]) or (record[4] is not seen[7] and record[4] != seen[7]):
+                return Ack.CONFLICT
+            self._expected = ChangeRequest
+        else:
+            self._expected = ChangePlan
+        self._open.append(record)
+        return _OK
+
+    def _finish(self, plan: Any) -> None:
+        seen, symptom, request = self._open
+        self.layout.pack_into(self._buffer, self._filled, seen, symptom, request, plan)
+        self._filled += self._row_size
+        self.window.append(_new(Pass, (seen, symptom, request, plan)))
+        self._open = []
+        self._expected = Observation
+        self.passes = self._number
+        self._number += 1
+        if self._filled == len(self._buffer):
+            self._flush()
+
+    def _unexpected(self, record: Record) -> Ack:
+        if record.loop != self.loop:
+            raise ValueError(f"a record of loop {record.loop} was sent to the log of loop {self.loop}")
+        number = record.pass_no
+        if number == 0 and isinstance(record, ChangePlan):
+            if self._start is not None:
+                return Ack.DUPLICATE if record == self._start else Ack.CONFLICT
+            self._hash.update(self.layout.pack_start(record))
+            self._start = record
+            self._number, self._expected = 1, Observation
+            return _OK
+        if number < 1:
+            raise ValueError(f"{type(record).__name__} {number}: passes are counted from 1; only plan 0 comes before")
+        there = self.find(type(record), number)
+        if there is not None:
+            return Ack.DUPLICATE if there == record else Ack.CONFLICT
+        return Ack.DUPLICATE if number <= self.passes else Ack.GAP
+
+    def find(self, kind: type[Record], number: int) -> Record | None:
+        """Return the record of that kind and pass, or None where it has not come yet or has left the window."""
+        if number == 0:
+            return self._start if kind is ChangePlan else None
+        stage = STAGES.index(kind)
+        if number == self.passes + 1:
+            return self._open[stage] if stage < len(self._open) else None
+        back = self.passes - number
+        return self.window[-1 - back][stage] if 0 <= back < len(self.window) else None
+
+    def since(self, number: int, stage: int = 0) -> Iterator[Record]:
+        """Yield what is readable from record (`number`, `stage`) on, in order.
+
+        Raises
+        ------
+        LookupError
+            That record has left the window.
+        """
+        if number == 0:
+            if self._start is not None:
+                yield self._start
+            number, stage = 1, 0
+        oldest = self.passes - len(self.window) + 1
+        if number < oldest:
+            raise LookupError(f"pass {number} has left the window; the oldest pass in memory is {oldest}")
+        for at in range(number, self.passes + 1):
+            yield from self.window[at - oldest][stage if at == number else 0 :]
+        yield from self._open[stage if number > self.passes else 0 :]
+
+    def flush(self) -> None:
+        """Hand the rows of all finished passes to the listeners."""
+        if self._filled:
+            self._flush()
+
+    def sha256(self) -> str:
+        """Hash the layout, plan 0 and all finished passes, as 64 hexadecimal digits."""
+        digest = self._hash.copy()
+        digest.update(memoryview(self._buffer)[: self._filled])
+        return digest.hexdigest()
+
+    def _flush(self) -> None:
+        rows = memoryview(self._buffer)[: self._filled]
+        self._hash.update(rows)
+        self._filled = 0
+        if self._listeners:
+            segment = np.frombuffer(rows, self.layout.dtype)
+            segment.flags.writeable = False
+            for listener in self._listeners:
+                listener(segment)

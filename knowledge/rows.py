@@ -1,0 +1,214 @@
+"""The fixed layout in which a pass is logged: one little-endian struct per pass.
+
+The same bytes are hashed by the log, read as a NumPy structured array by metrics and tables, and written by any
+engine that runs passes; so a per-episode table is the log itself, seen by column.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from knowledge.records import ChangePlan, ChangeRequest, Direction, Drift, Observation, Reading, Symptom
+
+DIRECTIONS = {"down": 1, "up": 2, "unknown": 3}
+"""Codes of a drift's direction in a row; 0 stands for no drift."""
+
+_WORD = (1 << 64) - 1
+
+
+class RowLayout:
+    """Layout of the rows of one run.
+
+    Parameters
+    ----------
+    signals
+        Names of the signals, in order.
+    detectors
+        Number of detectors.
+    rates
+        Number of learning-rate parameters in a plan.
+    max_actions
+        Actions have ids from 0 to ``max_actions - 1``; a set of them is a bit mask of ``ceil(max_actions / 64)`` words.
+    """
+
+    def __init__(self, signals: tuple[str, ...], detectors: int, rates: int, max_actions: int = 64) -> None:
+        self.signals = signals
+        self.detectors = detectors
+        self.rates = rates
+        self.max_actions = max_actions
+        words = -(-max_actions // 64)
+        hot: list[tuple[str, str, int | None]] = [
+            # (name, struct code, how many; None for a scalar): what changes with every pass
+            ("pass", "q", None),
+            ("plan", "q", None),
+            ("steps", "q", None),
+            ("epsilon", "d", None),
+            ("next_epsilon", "d", None),
+            ("signals", "d", len(signals)),
+            ("value", "d", detectors),
+            ("statistic", "d", detectors),
+            ("alarm", "?", detectors),
+        ]
+        rare: list[tuple[str, str, int | None]] = [
+            # what stays the same over most passes, and is packed only when it changes
+            ("direction", "B", detectors),
+            ("drift", "B", len(signals)),
+            ("reset_detector", "?", None),
+            ("next_reset_detector", "?", None),
+            ("available", "Q", words),
+            ("known", "Q", words),
+            ("added", "Q", words),
+            ("removed", "Q", words),
+            ("add", "Q", words),
+            ("drop", "Q", words),
+            ("enable", "Q", words),
+            ("learning_rate", "d", rates),
+            ("adopt", "32s", None),
+        ]
+        self._rare = _struct(rare)
+        self.struct = struct.Struct(f"{_struct(hot).format}{self._rare.size}s")
+        self.dtype = np.dtype([_column(*field) for field in hot + rare])
+        assert self.dtype.itemsize == self.struct.size
+        self._words = words
+        self._last_key: tuple[Any, ...] = ()
+        self._last_rare = b""
+
+    @property
+    def schema(self) -> bytes:
+        """Canonical text of the layout; the log's hash begins with it."""
+        head = {"signals": self.signals, "detectors": self.detectors, "rates": self.rates, "actions": self.max_actions}
+        return json.dumps(head, sort_keys=True, separators=(",", ":")).encode()
+
+    def pack_into(
+        self, buffer: bytearray, offset: int, seen: Observation, symptom: Symptom, request: ChangeRequest, plan: ChangePlan
+    ) -> None:
+        """Write one pass at `offset`.
+
+        Raises
+        ------
+        ValueError
+            An action id outside ``0 .. max_actions - 1``, or a record whose width is not the run's.
+        """
+        readings = symptom.readings
+        if self.detectors == 1:  # the common case, without a transposition
+            ((_, value, statistic, alarm, direction),) = readings
+            numbers: tuple[Any, ...] = (value, _NO_STATISTIC if statistic is None else statistic, alarm)
+            directions: tuple[Direction, ...] = (direction,)
+        else:
+            directions = tuple(r.direction for r in readings)
+            numbers = (
+                *[r.value for r in readings],
+                *[_NO_STATISTIC if r.statistic is None else r.statistic for r in readings],
+                *[r.alarm for r in readings],
+            )
+        _, number, in_force, epsilon, reset, steps, available, known, signals = seen
+        _, _, drifts, added, removed, _ = request
+        _, _, next_epsilon, rate, add, drop, enable, next_reset, adopt = plan
+        key = (directions, drifts, reset, next_reset, available, known, added, removed, add, drop, enable, rate, adopt)
+        try:
+            if key != self._last_key:
+                self._last_rare = self._pack_rare(*key)
+                self._last_key = key
+            self.struct.pack_into(
+                buffer, offset, number, in_force, steps, epsilon, next_epsilon, *signals.values(), *numbers, self._last_rare
+            )
+        except struct.error as error:
+            raise ValueError(
+                f"pass {seen.pass_no} does not fit the run's layout of {len(self.signals)} signals, "
+                f"{self.detectors} detectors and {self.rates} learning-rate parameters: {error}"
+            ) from error
+
+    def pack_start(self, plan: ChangePlan) -> bytes:
+        """Pack plan 0, which starts a run, as a pass in which nothing else happened."""
+        nothing = Observation(plan.loop, 0, 0, 0.0, False, 0, (), (), dict.fromkeys(self.signals, 0.0))
+        quiet = (Reading("", 0.0, None, False, "unknown"),) * self.detectors
+        buffer = bytearray(self.struct.size)
+        self.pack_into(
+            buffer,
+            0,
+            nothing,
+            Symptom(plan.loop, 0, nothing.signals, (), (), quiet),
+            ChangeRequest(plan.loop, 0, (), (), (), nothing.signals),
+            plan,
+        )
+        return bytes(buffer)
+
+    def _pack_rare(
+        self,
+        directions: tuple[Direction, ...],
+        drifts: tuple[Drift, ...],
+        reset: bool,
+        next_reset: bool,
+        available: tuple[int, ...],
+        known: tuple[int, ...],
+        added: tuple[int, ...],
+        removed: tuple[int, ...],
+        add: tuple[int, ...],
+        drop: tuple[int, ...],
+        enable: tuple[int, ...],
+        rate: tuple[float, ...],
+        adopt: str | None,
+    ) -> bytes:
+        masks = [
+            word
+            for actions in (available, known, added, removed, add, drop, enable)
+            for word in _mask(actions, self._words, self.max_actions)
+        ]
+        return self._rare.pack(
+            *[DIRECTIONS[direction] for direction in directions],
+            *self._drift_codes(drifts),
+            reset,
+            next_reset,
+            *masks,
+            *rate,
+            b"" if adopt is None else bytes.fromhex(adopt),
+        )
+
+    def _drift_codes(self, drifts: tuple[Drift, ...]) -> list[int]:
+        codes = dict.fromkeys(self.signals, 0)
+        for signal, direction in drifts:
+            if signal not in codes:
+                raise ValueError(f"drift of signal {signal!r}; the run's signals are {', '.join(self.signals)}")
+            if codes[signal]:
+                raise ValueError(f"two drifts of signal {signal!r} in one request; say it once")
+            codes[signal] = DIRECTIONS[direction]
+        return list(codes.values())
+
+
+_NUMPY_CODES = {"q": "<i8", "d": "<f8", "?": "?", "Q": "<u8", "B": "u1", "32s": "V32"}
+
+
+def _struct(fields: list[tuple[str, str, int | None]]) -> struct.Struct:
+    return struct.Struct("<" + "".join(code if count is None else f"{count}{code}" for _, code, count in fields))
+
+
+def _column(name: str, code: str, count: int | None) -> tuple[Any, ...]:
+    kind = _NUMPY_CODES[code]
+    return (name, kind) if count is None else (name, kind, (count,))
+
+
+_NO_STATISTIC = float("nan")
+
+
+def _mask(actions: tuple[int, ...], words: int, max_actions: int) -> tuple[int, ...]:
+    bits = 0
+    for action in actions:
+        if not 0 <= action < max_actions:
+            raise ValueError(
+                f"action id {action} is outside 0 .. {max_actions - 1}; raise system.max_actions if the system has more"
+            )
+        bits |= 1 << action
+    return tuple((bits >> (64 * word)) & _WORD for word in range(words))
+
+
+def actions_of(mask: Any) -> tuple[int, ...]:
+    """Read a mask column's words back as action ids.
+
+    >>> actions_of([5])
+    (0, 2)
+    """
+    return tuple(64 * w + bit for w, word in enumerate(mask) for bit in range(64) if int(word) >> bit & 1)

@@ -1,0 +1,5 @@
+"""Analyze: turns readings and action sets into events."""
+
+from mape.analyze.component import Analyze
+
+__all__ = ["Analyze"]

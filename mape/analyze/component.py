@@ -1,0 +1,42 @@
+"""The Analyze component."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from knowledge import ChangeRequest, Symptom
+from mape.errors import PartError
+from mape.ports import Analyzer
+
+
+class Analyze:
+    """Asks its analyzer what changed and sends the answer.
+
+    Parameters
+    ----------
+    analyzer
+        The method.
+    send
+        Takes the ChangeRequest.
+    """
+
+    def __init__(self, analyzer: Analyzer, send: Callable[[ChangeRequest], object]) -> None:
+        self.analyzer = analyzer
+        self._send = send
+
+    def on_symptom(self, symptom: Symptom) -> None:
+        """Turn a Symptom into a ChangeRequest.
+
+        Raises
+        ------
+        PartError
+            The analyzer raised.
+        """
+        try:
+            request = self.analyzer.analyze(symptom)
+        except Exception as error:
+            raise PartError(
+                f"analyzer {type(self.analyzer).__name__} raised {type(error).__name__}: {error}, at pass "
+                f"{symptom.pass_no}"
+            ) from error
+        self._send(request)

@@ -1,0 +1,198 @@
+"""Binds rules to a template, in plain Python or compiled.
+
+A template is a module-level function in whose globals some names are left to be bound: to rules, or to other
+templates' bindings. Plain Python gets a copy of the function with these globals. For Numba a module is written that
+imports the rules by name, holds the template's source, and is compiled with ``cache=True``; so that
+
+- no formula and no algorithm stands twice;
+- a second process compiles nothing: the rules are module-level globals, not closures or arguments, which Numba could
+  not cache;
+- no stale code is run: Numba's cache looks only at the file of the function itself, so the folder's name holds a hash
+  of the source of every module from which a rule comes, and of the versions of all that compiles.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import inspect
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+from mape.errors import ConfigError
+
+Rule = Callable[..., Any]
+Bindings = Mapping[str, "Rule | Composed"]
+on_compile: list[Callable[[str], object]] = []
+"""Called with a sentence before something is compiled that is not in the cache."""
+
+
+class Composed:
+    """A template with its free names bound.
+
+    Parameters
+    ----------
+    template
+        A module-level function.
+    bindings
+        Free name -> rule, or -> another `Composed`.
+    """
+
+    def __init__(self, template: Rule, bindings: Bindings) -> None:
+        self.template = template
+        self.bindings = dict(bindings)
+
+    def python(self) -> Rule:
+        """Return the bound function as plain Python."""
+        bound = {name: rule.python() if isinstance(rule, Composed) else rule for name, rule in self.bindings.items()}
+        plain: Any = self.template
+        return FunctionType(plain.__code__, {**plain.__globals__, **bound}, plain.__name__, plain.__defaults__)
+
+    def source(self) -> str:
+        """Return the text of a module that defines the bound function, compiled."""
+        imports: dict[str, str] = {"njit": "from numba import njit"}
+        body: list[str] = []
+        self._write(imports, body, self.template.__name__, "@njit(cache=True)")
+        head = ['"""Written by mapek; safe to delete."""', "", "from __future__ import annotations", ""]
+        return "\n".join([*head, *imports.values(), "", "", *body])
+
+    def _write(self, imports: dict[str, str], body: list[str], name: str, decorator: str) -> None:
+        template: Any = self.template
+        for free, rule in self.bindings.items():
+            if isinstance(rule, Composed):
+                rule._write(imports, body, free, "@njit(forceinline=True)")
+            else:
+                imports[free] = f"from {rule.__module__} import {rule.__qualname__} as {free}"
+        for used in template.__code__.co_names:
+            if used in template.__globals__ and used not in self.bindings:
+                line = f"from {template.__module__} import {used}"
+                if imports.setdefault(used, line) != line:
+                    raise ConfigError(f"two templates mean different things by {used!r}; rename one")
+        definition = inspect.getsource(template).split("(", 1)[1]
+        body.append(f"{decorator}\ndef {name}({definition}\n")
+
+    def rules(self) -> Iterator[Rule]:
+        """Yield the template and every rule that it reaches, each once."""
+        seen: set[int] = set()
+        pending: list[Any] = [self]
+        while pending:
+            item = pending.pop()
+            if isinstance(item, Composed):
+                pending += item.bindings.values()
+                item = item.template
+            if id(item) in seen or not isinstance(item, FunctionType):
+                continue
+            seen.add(id(item))
+            yield item
+            pending += [item.__globals__[used] for used in item.__code__.co_names if used in item.__globals__]
+
+    def compiled(self) -> Any:
+        """Return the bound function as a Numba dispatcher, from the cache where it can be.
+
+        Raises
+        ------
+        ConfigError
+            A rule is no module-level function, so that no module could import it.
+        """
+        rules = tuple(self.rules())
+        for rule in rules:
+            if rule.__qualname__ != rule.__name__ or rule.__name__ == "<lambda>":
+                raise ConfigError(
+                    f"{rule.__module__}.{rule.__qualname__} cannot be compiled: a rule is a module-level function. "
+                    "Move it out of its class or function, or choose the engine 'python'."
+                )
+        text = self.source()
+        return _load(text, _fingerprint(text, rules), self.template.__name__, rules)
+
+
+@functools.cache
+def _versions() -> str:
+    import llvmlite
+    import numba
+    import numpy
+
+    parts = (sys.version, numba.__version__, llvmlite.__version__, numpy.__version__, platform.machine())
+    return "\n".join(parts)
+
+
+def _fingerprint(text: str, rules: tuple[Rule, ...]) -> str:
+    digest = hashlib.sha256(f"{_versions()}\n{text}".encode())
+    for module in sorted({rule.__module__ for rule in rules}):
+        digest.update(inspect.getsource(sys.modules[module]).encode())
+    return digest.hexdigest()[:24]
+
+
+def cache_folder() -> Path:
+    """Return the folder of compiled code: ``$MAPEK_CACHE``, or ``mapek`` in the user's cache folder.
+
+    Where neither can be written, a folder in the system's temporary one that belongs to the user alone.
+    """
+    named = os.environ.get("MAPEK_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    for folder in (Path(named) if named else Path(base, "mapek"), Path(tempfile.gettempdir(), f"mapek-{os.getuid()}")):
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    raise ConfigError("no folder for compiled code can be written; name one in MAPEK_CACHE")
+
+
+@functools.cache
+def _load(text: str, key: str, name: str, rules: tuple[Rule, ...]) -> Any:
+    from numba.extending import register_jitable
+
+    for rule in rules:
+        # Lets compiled code call the rule as it stands, whatever module's globals it is found in. Inlining by force:
+        # a call that is left standing counts references to every array, ten times the cost of a step.
+        register_jitable(forceinline=True)(rule)
+    folder = cache_folder() / key
+    folder.mkdir(exist_ok=True)
+    path = folder / "composed.py"
+    if not path.exists():
+        with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".tmp", delete=False, encoding="utf-8") as file:
+            file.write(text)
+        os.replace(file.name, path)
+    spec = importlib.util.spec_from_file_location(f"_mapek_{key}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return getattr(module, name)
+
+
+def specialise(dispatcher: Any, arguments: tuple[Any, ...]) -> Rule:
+    """Return the machine code of `dispatcher` for the types of `arguments`, compiling it where the cache has none.
+
+    It skips the dispatcher's look at the types of each argument, which would cost more than an episode's arithmetic;
+    the caller therefore passes the same types every time.
+
+    Raises
+    ------
+    ConfigError
+        Numba cannot compile a rule.
+    """
+    import numba
+
+    signature = tuple(numba.typeof(argument) for argument in arguments)
+    if signature not in dispatcher.overloads:
+        folder = Path(dispatcher.py_func.__code__.co_filename).parent
+        if not any(folder.glob("__pycache__/*.nbc")):
+            for tell in on_compile:
+                tell("compiling the episode for this system and learner: some seconds, once")
+        try:
+            dispatcher.compile(signature)
+        except numba.core.errors.NumbaError as error:
+            raise ConfigError(
+                f"a rule cannot be compiled by Numba: {str(error).strip().splitlines()[-1]} Choose the engine 'python' to run it as it is, "
+                "or keep to what Numba compiles."
+            ) from error
+    return dispatcher.overloads[signature].entry_point  # type: ignore[no-any-return]

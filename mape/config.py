@@ -1,0 +1,307 @@
+"""Configs: TOML -> frozen pydantic models. An experiment is data: what runs, how long, which seeds.
+
+A file may name another one to start from (``extends``), and hold overlays: ``[profiles.NAME]`` and ``[agents.NAME]``
+are tables laid over the rest when that profile or agent is chosen. Overrides (``plan.alpha=0.2``) come last. A table
+that names a part (``name = "..."``) takes the place of one that names another part; else tables are merged.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from mape.errors import ConfigError, UnknownName
+
+Table = dict[str, Any]
+
+
+class PartConfig(BaseModel):
+    """Base of all options: frozen, strict, no unknown field, no NaN or infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class PartSpec(BaseModel):
+    """A part by short name or ``"module:Class"``, and its options; a string alone means no options."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
+
+    name: str = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def options(self) -> Table:
+        """Everything but the name."""
+        return dict(self.model_extra or {})
+
+
+class DetectorSpec(PartSpec):
+    """A detector and the signal that it watches."""
+
+    signal: str = "return"
+
+
+class PlannerSpec(PartSpec):
+    """A planner and its exploration schedule."""
+
+    schedule: PartSpec = Field(default_factory=lambda: PartSpec(name="exponential"))
+
+
+class BoxGrid(PartConfig):
+    """How a box of real observations becomes a table of states: equal bins per dimension.
+
+    Values outside [low, high] fall into the outer bins.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    bins: tuple[int, ...]
+
+    @model_validator(mode="after")
+    def _fits(self) -> BoxGrid:
+        if not len(self.low) == len(self.high) == len(self.bins) or not self.bins:
+            raise ValueError(
+                f"low, high and bins name {len(self.low)}, {len(self.high)} and {len(self.bins)} dimensions; each "
+                "needs one number per dimension of the observation"
+            )
+        for low, high, bins in zip(self.low, self.high, self.bins, strict=True):
+            if not low < high or bins < 1:
+                raise ValueError(f"low = {low}, high = {high}, bins = {bins}: low is below high, bins at least 1")
+        return self
+
+
+class SystemConfig(PartConfig):
+    """The managed system: a Gymnasium id, its keyword arguments, and how it is seen."""
+
+    id: str = Field(min_length=1)
+    options: dict[str, Any] = {}
+    max_steps: int | None = Field(None, ge=1, le=1_000_000, description="longest episode; needed where the system has no cap")
+    max_actions: int = Field(64, ge=1, le=4096, description="largest number of actions that the records can hold")
+    discretise: BoxGrid | None = None
+
+
+class MonitorConfig(PartConfig):
+    """What is watched, by which detectors; an empty list watches nothing."""
+
+    detectors: tuple[DetectorSpec, ...] = ()
+
+
+class ExecuteConfig(PartConfig):
+    """How episodes are driven."""
+
+    engine: str = "auto"
+    mask_greedy: bool = False
+
+    @field_validator("engine")
+    @classmethod
+    def _known(cls, engine: str) -> str:
+        if engine not in ("auto", "compiled", "python"):
+            raise ValueError(f"engine {engine!r} is not one of auto, compiled, python")
+        return engine
+
+
+class Config(PartConfig):
+    """A whole run."""
+
+    name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    description: str = ""
+    episodes: int = Field(ge=1, le=1_000_000_000, description="passes of the loop; one episode each")
+    trials: int = Field(1, ge=1, le=10_000_000, description="independent repetitions")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="root of all randomness")
+    system: SystemConfig
+    learner: PartSpec = Field(default_factory=lambda: PartSpec(name="q_learning"))
+    monitor: MonitorConfig = MonitorConfig()
+    analyze: PartSpec = Field(default_factory=lambda: PartSpec(name="changes"))
+    plan: PlannerSpec = Field(default_factory=lambda: PlannerSpec(name="morphin"))
+    execute: ExecuteConfig = ExecuteConfig()
+
+    def to_json(self) -> str:
+        """Write the config as JSON, from which `from_table` makes it again."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True)
+
+
+def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
+    """Make a config of a plain table, with every part's options checked.
+
+    Raises
+    ------
+    ConfigError
+        Names each field that is wrong, its value, and what is legal.
+    """
+    from mape import registry
+
+    try:
+        # From JSON text, where a list may stand for a tuple even in strict mode.
+        config = Config.model_validate_json(json.dumps(table, default=_refuse))
+    except ValidationError as error:
+        raise ConfigError(_explain(error, where)) from None
+    for kind, path, spec in parts_of(config):
+        registry.options_of(kind, spec, f"{where}: {path}")
+    return config
+
+
+def parts_of(config: Config) -> Iterable[tuple[str, str, PartSpec]]:
+    """Yield kind, path and spec of every part that a config names."""
+    yield "learner", "learner", config.learner
+    for i, detector in enumerate(config.monitor.detectors):
+        yield "detector", f"monitor.detectors[{i}]", detector
+    yield "analyzer", "analyze", config.analyze
+    yield "planner", "plan", config.plan
+    yield "schedule", "plan.schedule", config.plan.schedule
+
+
+def load(
+    path: str | Path,
+    *,
+    profile: str | None = None,
+    agent: str | None = None,
+    overrides: Iterable[str] = (),
+) -> Config:
+    """Read a config file; lay profile, agent and overrides over it, in this order.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or what it says is not legal.
+    """
+    table = read_table(path)
+    for kind, chosen in (("profile", profile), ("agent", agent)):
+        overlays = table.pop(f"{kind}s", {})
+        if not isinstance(overlays, dict):
+            raise ConfigError(f"{path}: {kind}s is a table of tables, [{kind}s.NAME]")
+        if chosen is not None:
+            if chosen not in overlays:
+                raise UnknownName(kind, chosen, overlays, f"They are the [{kind}s.NAME] tables of {path}.")
+            table = merge(table, overlays[chosen])
+    for override in overrides:
+        table = merge(table, parse_override(override))
+    return from_table(table, str(path))
+
+
+def overlays_of(path: str | Path, kind: str) -> list[str]:
+    """Return the names of a file's profiles or agents, in its order."""
+    return list(read_table(path).get(f"{kind}s", {}))
+
+
+def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
+    """Read a TOML file and what it extends."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in the folder examples") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from None
+    base = table.pop("extends", None)
+    if base is None:
+        return table
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: extends = {base!r} is not the path of another config file")
+    if path.resolve() in _seen:
+        raise ConfigError(f"{path} extends itself, by way of {' -> '.join(p.name for p in _seen)}")
+    below = read_table(path.parent / base, (*_seen, path.resolve()))
+    # What a file adds to another stands for itself: the other's overlays are not its own.
+    below.pop("agents", None)
+    below.pop("profiles", None)
+    return merge(below, table)
+
+
+def merge(base: Any, over: Any) -> Any:
+    """Lay one table over another; see the module."""
+    if isinstance(base, str) and isinstance(over, dict):
+        base = {"name": base}
+    if not isinstance(base, dict) or not isinstance(over, dict):
+        return over
+    if "name" in over and "name" in base and over["name"] != base["name"] and "system" not in base:
+        return dict(over)
+    merged = dict(base)
+    for key, value in over.items():
+        merged[key] = merge(base[key], value) if key in base else value
+    return merged
+
+
+def parse_override(text: str) -> Table:
+    """Read ``a.b=VALUE``; VALUE is TOML, or else a string.
+
+    >>> parse_override("plan.alpha=0.2"), parse_override("plan=q_learning")
+    ({'plan': {'alpha': 0.2}}, {'plan': 'q_learning'})
+    """
+    key, equals, text_value = text.partition("=")
+    path = key.strip().split(".")
+    if not equals or not all(path):
+        raise ConfigError(f"--set {text!r} is not KEY=VALUE with a dotted key, such as plan.alpha=0.2")
+    try:
+        value = tomllib.loads(f"value = {text_value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text_value.strip()
+    for part in reversed(path):
+        value = {part: value}
+    table: Table = value
+    return table
+
+
+def _refuse(value: Any) -> Any:
+    raise ConfigError(f"{value!r} is not a number, text, true or false, or a list or table of such")
+
+
+def _explain(error: ValidationError, where: str) -> str:
+    import difflib
+
+    lines = []
+    for problem in error.errors():
+        loc = ".".join(str(part) for part in problem["loc"])
+        message = problem["msg"].removeprefix("Value error, ")
+        given = problem.get("input")
+        if problem["type"] == "extra_forbidden":
+            legal = _fields_at(problem["loc"][:-1])
+            close = difflib.get_close_matches(str(problem["loc"][-1]), legal, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else f"; legal: {', '.join(legal)}" if legal else ""
+            message = f"no such option{hint}"
+        elif problem["type"] == "missing":
+            message = "is needed and missing"
+        elif not isinstance(given, dict):
+            message = f"{message[:1].lower()}{message[1:]}, got {given!r}"
+        lines.append(f"{where}: {loc}: {message}" if loc else f"{where}: {message}")
+    return "\n".join(lines)
+
+
+def _fields_at(loc: tuple[Any, ...]) -> list[str]:
+    model: Any = Config
+    for part in loc:
+        fields = getattr(model, "model_fields", {})
+        if isinstance(part, int) or part not in fields:
+            return []
+        annotation = fields[part].annotation
+        kinds = [annotation, *getattr(annotation, "__args__", ())]
+        model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+    return list(getattr(model, "model_fields", {}))
+
+
+def explain_options(error: ValidationError, where: str, legal: Iterable[str]) -> str:
+    """Turn the errors of a part's own options into sentences."""
+    import difflib
+
+    legal = list(legal)
+    lines = []
+    for problem in error.errors():
+        loc = ".".join(str(part) for part in problem["loc"])
+        message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "extra_forbidden":
+            close = difflib.get_close_matches(loc, legal, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            message = f"no such option{hint} Legal: {', '.join(legal) or 'none'}"
+        elif problem["type"] != "value_error":
+            message = f"{message[:1].lower()}{message[1:]}, got {problem.get('input')!r}"
+        lines.append(f"{where}.{loc}: {message}" if loc else f"{where}: {message}")
+    return "\n".join(lines)

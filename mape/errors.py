@@ -1,0 +1,58 @@
+"""Everything that mapek raises on purpose.
+
+    MapekError
+    |-- ConfigError          a config, an option or a name that is not legal
+    |   `-- UnknownName      a part, system or option that does not exist ("did you mean ...?")
+    |-- PartError            a detector, planner, schedule or learner that raised or broke its contract
+    |-- ManagedSystemError   a managed system that raised or broke its contract
+    |   `-- NonFiniteError   a reward, TD error or signal that is NaN or infinite
+    |-- BusError             a record that could not be sent or delivered
+    `-- ResultsError         a results folder that is taken, truncated, of another config, or cannot be written
+
+Each message names the value, what is legal, and the way out. The CLI prints it as one paragraph and exits with 1,
+or with 2 for a ConfigError.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class MapekError(Exception):
+    """Base of all errors that are raised on purpose."""
+
+
+class ConfigError(MapekError):
+    """A config, an option or a name that is not legal."""
+
+
+class UnknownName(ConfigError):
+    """A name that is not one of the legal ones."""
+
+    def __init__(self, what: str, name: str, legal: Iterable[str], way_out: str = "") -> None:
+        legal = sorted(legal)
+        close = difflib.get_close_matches(name, legal, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        extra = f" {way_out}" if way_out else ""
+        super().__init__(f"unknown {what} {name!r}{hint} Known: {', '.join(legal)}.{extra}".replace("?  ", "? "))
+
+
+class PartError(MapekError):
+    """A part of the loop raised, or broke its contract."""
+
+
+class ManagedSystemError(MapekError):
+    """A managed system raised, or broke its contract."""
+
+
+class NonFiniteError(ManagedSystemError):
+    """A number of the managed system is NaN or infinite; nothing of the episode was learnt."""
+
+
+class BusError(MapekError):
+    """A record could not be sent or delivered."""
+
+
+class ResultsError(MapekError):
+    """A results folder is taken, truncated, of another config, or cannot be written."""

@@ -1,0 +1,349 @@
+"""The Execute component: drives episodes under the plan in force, and owns the Q-table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from knowledge import ChangePlan, Knowledge, Observation, QTable
+from mape.compose import Composed, specialise
+from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
+from mape.execute import drive, episode
+from mape.execute.rules import rate_array
+from mape.ports import Episode, Learner, ManagedSystem
+
+SIGNALS = ("return", "steps", "td_error", "q_change")
+"""Signals of every run: return, steps, mean absolute TD error, largest absolute change of Q; the system's own follow."""
+
+DRAWS_AT_ONCE = 8192
+"""Uniforms drawn from the trial's generator in one go: cheaper per pass, and the same stream."""
+
+_new = tuple.__new__
+
+
+class Execute:
+    """Drives one episode per pass, and reports it.
+
+    An episode is a pure function of (config, seed, trial, number, Q, plan): its randomness is a block of uniforms of
+    fixed size from the trial's generator, and for systems that do not take it a seed made from seed, trial and number.
+
+    Parameters
+    ----------
+    system, learner
+        What is managed, and how it learns.
+    knowledge
+        Its entries ``actions`` and the Q-table are written here.
+    send
+        Takes the Observation.
+    seed, trial, loop
+        Which stream of randomness is used.
+    engine
+        ``"compiled"``: one compiled call per episode, of the rules that the system offers; ``"python"``: the same
+        through the system's ``step``; ``"auto"``: compiled where rules are offered.
+    mask_greedy
+        Whether the system's action mask limits the greedy choice and the TD target too, not only exploration.
+    max_actions
+        Largest number of actions that the run's records can hold.
+    """
+
+    def __init__(
+        self,
+        system: ManagedSystem,
+        learner: Learner,
+        knowledge: Knowledge,
+        send: Callable[[Observation], object],
+        *,
+        seed: int = 0,
+        trial: int = 0,
+        loop: int = 0,
+        engine: str = "auto",
+        mask_greedy: bool = False,
+        max_actions: int = 64,
+    ) -> None:
+        self.system = system
+        self.learner = learner
+        self.plan: ChangePlan | None = None
+        self.passes = 0
+        self._knowledge = knowledge
+        self._send = send
+        self._loop = loop
+        self._seeds = (seed, loop, trial)
+        self._mask_greedy = mask_greedy
+        self._max_actions = max_actions
+        self._own_signals = system.signal_names
+        self.trace: Callable[[int, npt.NDArray[np.float64]], object] | None = None
+        self._traced = range(0)
+
+        if engine == "compiled" and system.rules is None:
+            raise ConfigError(
+                f"engine 'compiled' needs a system that offers its rules; {system.name} does not. Choose 'auto' or 'python'."
+            )
+        self._rules = None if engine == "python" else system.rules
+        reset_draws, step_draws = system.draws
+        cap = system.max_steps
+        self._system_draws = reset_draws + cap * step_draws
+        self._width = self._system_draws + 2 * cap
+        self._per_refill = max(1, DRAWS_AT_ONCE // self._width)
+        sequence = np.random.SeedSequence(entropy=seed, spawn_key=(loop, trial))
+        self._generator = np.random.Generator(np.random.PCG64(sequence))
+        self._uniforms = np.empty(self._per_refill * self._width)
+        self._drawn = 0  # number of the pass whose block comes next in a refill
+
+        self._journal = np.empty(cap, dtype=np.int64)
+        self._saved = np.empty(cap)
+        self._used = np.zeros(2, dtype=np.int64)
+        self._context = np.zeros(len(system.signal_names))
+        self._no_trace = np.empty((0, len(episode.TRACE_COLUMNS)))
+        self._tail = (learner.discount, learner.bootstrap_terminal, mask_greedy, reset_draws, step_draws, cap)
+        self._target: Any = system if self._rules is None else self._rules.params
+        self._available: tuple[int, ...] = ()
+        self._rate = rate_array((0.0,) * len(learner.rate_names))
+
+        first = system.available(1)
+        if first is None:
+            first = self._begin(1, np.zeros(self._width))
+        self._take_actions(first, 1)
+        self._set_table(QTable(first, system.n_states))
+        self._drive = self._bind()
+        knowledge.serve_q_table(lambda: self.q_table.copy())
+
+    def record_trace(self, first: int, last: int, listener: Callable[[int, npt.NDArray[np.float64]], object]) -> None:
+        """Hand the steps of episodes `first` to `last` to `listener`, with the columns of `TRACE_COLUMNS`."""
+        self._traced = range(first, last + 1)
+        self.trace = listener
+
+    def adopt(self, plan: ChangePlan) -> None:
+        """Put a plan in force: enable actions, grow or shrink the Q-table, or take a remembered one.
+
+        Raises
+        ------
+        PartError
+            The plan names an action that cannot be dropped, or a table that is not remembered.
+        """
+        if plan.add or plan.drop or plan.enable or plan.adopt is not None:
+            self._change_table(plan)
+        if self.plan is None or plan.learning_rate != self.plan.learning_rate:
+            if len(plan.learning_rate) != len(self.learner.rate_names):
+                raise PartError(
+                    f"plan {plan.pass_no} has {len(plan.learning_rate)} learning-rate parameters; the learner takes "
+                    f"{len(self.learner.rate_names)}: {', '.join(self.learner.rate_names)}"
+                )
+            self._rate = rate_array(plan.learning_rate)
+            self._fix_arguments()
+        self.plan = plan
+
+    def drive(self) -> None:
+        """Run the next episode under the plan in force and send its Observation.
+
+        Raises
+        ------
+        ManagedSystemError
+            The system raised, offered no action, or left its state space. The Q-table is as before the episode.
+        NonFiniteError
+            A reward, a TD error or a signal was NaN or infinite. The Q-table is as before the episode.
+        """
+        plan = self.plan
+        if plan is None:
+            raise PartError("no plan is in force; plan 0 starts a run")
+        number = self.passes + 1
+        turn = self.passes % self._per_refill
+        if turn == 0:
+            self._generator.random(out=self._uniforms)
+        at = turn * self._width
+
+        available = self.system.available(number) if self._rules is not None else None
+        if available is None:
+            available = self._begin(number, self._uniforms[at : at + self._width])
+        if available is not self._available:
+            self._take_actions(available, number)
+            self._set_rows()
+        tracing = number in self._traced
+        trace = np.empty((self.system.max_steps, len(episode.TRACE_COLUMNS))) if tracing else self._no_trace
+        try:
+            status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
+        except BaseException as error:
+            self._roll_back()
+            if isinstance(error, MapekError) or not isinstance(error, Exception):
+                raise
+            raise ManagedSystemError(
+                f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step "
+                f"{int(self._used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes before it are "
+                "kept."
+            ) from error
+        if status != episode.OK:
+            self._roll_back()
+            raise self._refused(status, number, steps, total, td_error, change)
+        signals = {"return": total, "steps": float(steps), "td_error": td_error, "q_change": change}
+        if self._own_signals:
+            self._add_own_signals(signals, number)
+        self.passes = number
+        if tracing and self.trace is not None:
+            self.trace(number, trace[:steps])
+        self._send(
+            _new(
+                Observation,
+                (
+                    self._loop,
+                    number,
+                    plan.pass_no,
+                    plan.epsilon,
+                    plan.reset_detector,
+                    steps,
+                    available,
+                    self.q_table.actions,
+                    signals,
+                ),
+            )
+        )
+
+    @property
+    def compiled(self) -> bool:
+        """Whether an episode is one compiled call."""
+        return self._rules is not None
+
+    def _bind(self) -> Callable[..., tuple[int, int, float, float, float]]:
+        rules = self._rules
+        learner = {"value": self.learner.value, "step_size": self.learner.step_size}
+        if rules is None:
+            plain = Composed(
+                episode.episode,
+                {
+                    "begin": drive.begin_by_calls,
+                    "act": drive.act_by_calls,
+                    "explorable": drive.explorable_by_calls,
+                    **learner,
+                },
+            ).python()
+
+            def quiet(*arguments: Any) -> Any:
+                # What overflows is refused by the episode itself, with the number in the message.
+                with np.errstate(all="ignore"):
+                    return plain(*arguments)
+
+            return quiet
+        begin = Composed(drive.begin_by_rules, {"phase_rule": rules.phase, "reset_rule": rules.reset})
+        act = Composed(drive.act_by_rules, {"step_rule": rules.step})
+        bound = Composed(episode.episode, {"begin": begin, "act": act, "explorable": rules.explorable, **learner})
+        return specialise(bound.compiled(), (1, 0.5, 0, self._no_trace, *self._fixed))
+
+    def _fix_arguments(self) -> None:
+        # What stays from episode to episode, in the order of `episode.episode`.
+        self._fixed = (
+            self._target,
+            self.q_table.values,
+            self._touched,
+            self._journal,
+            self._saved,
+            self._used,
+            self._rows,
+            self._choices,
+            self._actions,
+            self._rate,
+            self._uniforms,
+            self._context,
+            *self._tail,
+        )
+
+    def _begin(self, number: int, block: npt.NDArray[np.float64]) -> tuple[int, ...]:
+        seed = int(np.random.SeedSequence((*self._seeds, number)).generate_state(1)[0])
+        try:
+            _, available = self.system.begin(Episode(number, seed, block[: self._system_draws]))
+        except MapekError:
+            raise
+        except Exception as error:
+            raise ManagedSystemError(
+                f"{self.system.name} raised {type(error).__name__}: {error}, at the reset of episode {number}. The "
+                f"{self.passes} passes before it are kept."
+            ) from error
+        # One object as long as nothing changes: what compares by identity is cheap downstream.
+        return self._available if available == self._available else available
+
+    def _take_actions(self, available: tuple[int, ...], number: int) -> None:
+        if not available:
+            raise ManagedSystemError(
+                f"{self.system.name} offers no action in episode {number}; a managed system has at least one available"
+            )
+        for action in available:
+            if not 0 <= action < self._max_actions:
+                raise ManagedSystemError(
+                    f"{self.system.name} offers action {action} in episode {number}; ids are integers from 0 to "
+                    f"{self._max_actions - 1}. Raise system.max_actions if it has more."
+                )
+        self._available = available
+
+    def _add_own_signals(self, signals: dict[str, float], number: int) -> None:
+        for name, value in zip(self._own_signals, self._context.tolist(), strict=True):
+            if not isfinite(value):
+                self._roll_back()
+                raise NonFiniteError(
+                    f"{self.system.name} gave {name} = {value} in episode {number}; signals are finite. Nothing of "
+                    f"that episode was learnt; the {self.passes} passes before it are kept."
+                )
+            signals[name] = value
+
+    def _set_table(self, table: QTable) -> None:
+        self.q_table = table
+        # Stamps are episode numbers, from 1: a fresh table is untouched.
+        self._touched = np.zeros(table.values.shape, dtype=np.int64)
+        self._actions = np.array(table.actions, dtype=np.int64)
+        self._knowledge.actions = table.actions
+        self._set_rows()
+
+    def _set_rows(self) -> None:
+        usable = [row for row, action in enumerate(self.q_table.actions) if action in self._available]
+        if not usable:
+            raise ManagedSystemError(
+                f"{self.system.name} offers actions {self._available}, of which the Q-table knows none: it has "
+                f"{self.q_table.actions}. A new action is first tried in the episode after the one that reports it, so "
+                "at least one known action must stay."
+            )
+        self._rows = np.array(usable, dtype=np.int64)
+        self._choices = np.empty_like(self._rows)
+        self._fix_arguments()
+
+    def _change_table(self, plan: ChangePlan) -> None:
+        try:
+            table = self.q_table.copy() if plan.adopt is None else self._knowledge.recall(plan.adopt)
+            table.add(plan.add)
+            table.drop(plan.drop)
+            if plan.enable:
+                self.system.enable(plan.enable)
+        except (LookupError, ValueError) as error:
+            raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
+        if table.n_states != self.system.n_states:
+            raise PartError(
+                f"plan {plan.pass_no} adopts a Q-table of {table.n_states} states; {self.system.name} has "
+                f"{self.system.n_states}"
+            )
+        if plan.enable:
+            after = self.system.available(self.passes + 1)
+            if after is not None:
+                self._available = after
+        self._set_table(table)
+
+    def _roll_back(self) -> None:
+        values = self.q_table.values.reshape(-1)
+        used = int(self._used[0])
+        values[self._journal[:used]] = self._saved[:used]
+
+    def _refused(
+        self, status: int, number: int, steps: int, first: float, action: float, td_error: float
+    ) -> ManagedSystemError:
+        where = f"in episode {number} at step {steps}"
+        kept = f"Nothing of that episode was learnt; the {self.passes} passes before it are kept."
+        if status == episode.OFF_TABLE:
+            return ManagedSystemError(
+                f"{self.system.name} went to state {int(first)} {where}; its states are 0 .. {self.system.n_states - 1}. {kept}"
+            )
+        if isfinite(first):
+            return NonFiniteError(
+                f"the TD error became {td_error} {where} (reward {first}, action {int(action)}): the Q-values diverge. "
+                f"{kept} Lower discount, alpha or the rewards."
+            )
+        return NonFiniteError(
+            f"{self.system.name} gave reward {first} for action {int(action)} {where}; rewards are finite numbers. {kept}"
+        )

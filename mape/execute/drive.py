@@ -1,0 +1,44 @@
+"""The bindings that fit a system to the episode: compilable rules, or any object with `begin` and `step`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mape.execute.rules import Floats
+
+phase_rule: Any
+reset_rule: Any
+step_rule: Any
+
+
+def begin_by_rules(params: Any, number: int, draws: Floats, at: int) -> tuple[int, int]:
+    """Begin an episode of a system that offers its rules; return phase and state."""
+    phase = phase_rule(params, number)
+    return phase, reset_rule(params, phase, draws, at)
+
+
+def act_by_rules(
+    params: Any, phase: int, state: int, action: int, draws: Floats, at: int, context: Floats
+) -> tuple[int, float, bool, bool]:
+    """Take a step of a system that offers its rules; the step cap alone truncates."""
+    next_state, reward, terminated = step_rule(params, phase, state, action, draws, at, context)
+    return next_state, reward, terminated, False
+
+
+def begin_by_calls(system: Any, number: int, draws: Floats, at: int) -> tuple[int, int]:
+    """Hand on the state that the system's reset gave; calls know no phase."""
+    return 0, system.first_state
+
+
+def act_by_calls(
+    system: Any, phase: int, state: int, action: int, draws: Floats, at: int, context: Floats
+) -> tuple[int, float, bool, bool]:
+    """Call the system's step."""
+    result: tuple[int, float, bool, bool] = system.step(int(action), context)
+    return result
+
+
+def explorable_by_calls(system: Any, phase: int, state: int, action: int) -> bool:
+    """Ask the system, whose mask is that of the present state."""
+    answer: bool = system.explorable(int(action))
+    return answer

@@ -1,0 +1,85 @@
+"""The rules of learning: pure functions of numbers, in plain Python that Numba can compile.
+
+`q` is a Q-table's values, shape (rows, states); ``rows[:count]`` are the rows that may be used, in the table's order.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mape.config import PartConfig
+from pydantic import Field
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+def greedy(q: Floats, rows: Ints, count: int, state: int) -> int:
+    """Return the row of the largest value of `state`; of equal ones, the first."""
+    best = rows[0]
+    for i in range(1, count):
+        if q[rows[i], state] > q[best, state]:
+            best = rows[i]
+    return best
+
+
+def max_value(q: Floats, rows: Ints, count: int, state: int, epsilon: float) -> float:
+    """Return the largest value of `state`: what Q-learning bootstraps from (Watkins 1989)."""
+    return q[greedy(q, rows, count, state), state]
+
+
+def expected_value(q: Floats, rows: Ints, count: int, state: int, epsilon: float) -> float:
+    """Return the mean value of `state` under the epsilon-greedy policy: Expected Sarsa (van Seijen et al. 2009)."""
+    total = 0.0
+    for i in range(count):
+        total += q[rows[i], state]
+    return (1.0 - epsilon) * max_value(q, rows, count, state, epsilon) + epsilon * total / count
+
+
+def alpha_star(td_error: float, rate: Floats) -> float:
+    """Return MORPHIN's learning rate, from rate = (alpha, alpha_max, k) (arXiv 2601.20714).
+
+    alpha* = alpha + (alpha_max - alpha) / (1 + exp(-(|TD error| - k)))
+
+    >>> round(alpha_star(-1.0, (0.1, 0.99, 5.0)), 12)
+    0.116007726866
+    """
+    return rate[0] + (rate[1] - rate[0]) / (1.0 + math.exp(-(abs(td_error) - rate[2])))
+
+
+class LearnerConfig(PartConfig):
+    """Options of a learner."""
+
+    discount: float = Field(0.9, ge=0, le=1, description="gamma")
+    bootstrap_terminal: bool = Field(
+        False, description="bootstrap from a terminal state too, as the published code of MORPHIN does"
+    )
+
+
+class QLearning:
+    """Q-learning: TD error = r + gamma * max_a Q(s', a) - Q(s, a); Q(s, a) += alpha* * TD error."""
+
+    Config = LearnerConfig
+    rate_names = ("alpha", "alpha_max", "k")
+    value = staticmethod(max_value)
+    step_size = staticmethod(alpha_star)
+
+    def __init__(self, config: LearnerConfig) -> None:
+        self.config = config
+        self.discount = config.discount
+        self.bootstrap_terminal = config.bootstrap_terminal
+
+
+class ExpectedSarsa(QLearning):
+    """Expected Sarsa: as Q-learning, but bootstraps from the epsilon-greedy policy's mean value."""
+
+    value = staticmethod(expected_value)
+
+
+def rate_array(rate: tuple[float, ...]) -> Any:
+    """Return a plan's learning rate as the array that the compiled episode takes."""
+    return np.array(rate, dtype=np.float64)

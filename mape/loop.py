@@ -1,0 +1,122 @@
+"""The loop: one pass, written once.
+
+                 Knowledge (log, plan in force, known actions, Q by request)
+                    |           |             |           |
+    Observation -> Monitor -> Symptom -> Analyze -> ChangeRequest -> Plan -> ChangePlan -> Execute
+         ^                                                                                   |
+         +--------------------------- managed system <---------------------------------------+
+"""
+
+from __future__ import annotations
+
+from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, Record, RowLayout, Symptom
+from mape import registry
+from mape.analyze import Analyze
+from mape.bus import LocalBus
+from mape.config import Config
+from mape.errors import ConfigError
+from mape.execute import Execute
+from mape.execute.component import SIGNALS
+from mape.monitor import Monitor
+from mape.plan import Plan
+from mape.ports import ManagedSystem
+
+
+def layout_of(config: Config, system: ManagedSystem) -> RowLayout:
+    """Return the layout of the rows that a run of `config` on `system` logs.
+
+    Raises
+    ------
+    ConfigError
+        A detector watches a signal that the run does not have.
+    """
+    signals = SIGNALS + system.signal_names
+    for detector in config.monitor.detectors:
+        if detector.signal not in signals:
+            raise ConfigError(
+                f"detector {detector.name!r} watches signal {detector.signal!r}; {system.name} has {', '.join(signals)}"
+            )
+    learner = registry.build("learner", config.learner)
+    return RowLayout(signals, len(config.monitor.detectors), len(learner.rate_names), config.system.max_actions)
+
+
+class Loop:
+    """The four components over one Knowledge, in one process.
+
+    Parameters
+    ----------
+    config
+        What runs.
+    system
+        The managed system, fresh.
+    trial, loop
+        Which stream of randomness is used.
+
+    Examples
+    --------
+    >>> from mape.config import load
+    >>> from adapters.systems import make_system
+    >>> config = load("examples/gridworld_goals.toml")
+    >>> loop = Loop(config, make_system(config.system))
+    >>> loop.run(3)
+    >>> loop.log.window[-1].plan.pass_no
+    3
+    """
+
+    def __init__(self, config: Config, system: ManagedSystem, trial: int = 0, loop: int = 0) -> None:
+        self.config = config
+        self.system = system
+        self.log = Log(layout_of(config, system), loop)
+        self.knowledge = Knowledge(self.log)
+        self.bus = LocalBus(self.log)
+        send = self.bus.send
+        detectors = [(spec.signal, registry.build("detector", spec)) for spec in config.monitor.detectors]
+        schedule = registry.build("schedule", config.plan.schedule)
+        self.monitor = Monitor(detectors, send)
+        self.analyze = Analyze(registry.build("analyzer", config.analyze), send)
+        self.plan = Plan(registry.build("planner", config.plan, schedule=schedule), self.knowledge, send)
+        self.execute = Execute(
+            system,
+            registry.build("learner", config.learner),
+            self.knowledge,
+            send,
+            seed=config.seed,
+            trial=trial,
+            loop=loop,
+            engine=config.execute.engine,
+            mask_greedy=config.execute.mask_greedy,
+            max_actions=config.system.max_actions,
+        )
+        self.bus.subscribe(Observation, self.monitor.on_observation)
+        self.bus.subscribe(Symptom, self.analyze.on_symptom)
+        self.bus.subscribe(ChangeRequest, self.plan.on_request)
+        self.bus.subscribe(ChangePlan, self.execute.adopt)
+
+    def advance(self) -> Record:
+        """Move by one record, and return it: the next that waits, or the Observation of a new episode."""
+        record = self.bus.deliver()
+        if record is None:
+            if self.execute.plan is None:
+                self.plan.start(self.log.loop)
+            else:
+                self.execute.drive()
+            record = self.bus.deliver()
+        assert record is not None
+        return record
+
+    def run(self, passes: int) -> None:
+        """Run that many passes, each to its end.
+
+        Raises
+        ------
+        PartError, ManagedSystemError
+            What a part or the system raised; the passes before it are logged.
+        """
+        drive, settle = self.execute.drive, self.bus.run
+        if self.execute.plan is None and self.knowledge.plan is None:
+            self.plan.start(self.log.loop)
+        settle()
+        for _ in range(passes):
+            drive()
+            settle()
+

@@ -1,0 +1,64 @@
+"""The Monitor component: one detector reading per watched signal and pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from knowledge import Observation, Reading, Symptom
+from mape.errors import PartError
+from mape.ports import Detector
+
+_new = tuple.__new__  # half the cost of a named tuple's own constructor, on the hot path
+
+
+class Monitor:
+    """Feeds each detector its signal and says what it reads.
+
+    A detector that alarms is reset at once. A reset that Plan wants comes back with the next Observation, and is done
+    before that observation is fed.
+
+    Parameters
+    ----------
+    detectors
+        Pairs of a signal's name and the detector that watches it.
+    send
+        Takes the Symptom.
+    """
+
+    def __init__(self, detectors: Sequence[tuple[str, Detector]], send: Callable[[Symptom], object]) -> None:
+        self.detectors = tuple(detectors)
+        self._send = send
+
+    def on_observation(self, seen: Observation) -> None:
+        """Turn an Observation into a Symptom.
+
+        Raises
+        ------
+        PartError
+            A detector raised, or watches a signal that the run does not have.
+        """
+        loop, number, _, _, reset, _, available, known, signals = seen
+        readings = []
+        for name, detector in self.detectors:
+            try:
+                if reset:
+                    detector.reset()
+                value = signals[name]
+                alarm = detector.update(value)
+                reading = _new(Reading, (name, value, detector.statistic, alarm, detector.direction))
+                if alarm:
+                    detector.reset()
+            except Exception as error:
+                raise self._failed(name, detector, seen, error) from error
+            readings.append(reading)
+        self._send(_new(Symptom, (loop, number, signals, available, known, tuple(readings))))
+
+    @staticmethod
+    def _failed(name: str, detector: Detector, seen: Observation, error: Exception) -> PartError:
+        if isinstance(error, KeyError) and name not in seen.signals:
+            return PartError(f"a detector watches signal {name!r}; the run has {', '.join(seen.signals)}")
+        return PartError(
+            f"detector {type(detector).__name__} raised {type(error).__name__}: {error}, at pass {seen.pass_no} on "
+            f"{name} = {seen.signals.get(name)}. Records up to that observation are kept; choose another detector in "
+            "[monitor], or mend this one and run `mapek check` on it."
+        )

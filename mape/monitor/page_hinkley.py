@@ -1,0 +1,86 @@
+"""Page-Hinkley test for a fall of the mean.
+
+    n    <- n + 1
+    mean <- mean + (x - mean) / n
+    c    <- c + mean - x - delta
+    m    <- min(m, c)                      (m starts at 0)
+    alarm iff c - m > threshold
+
+One-sided: it sees falls only. Equal, alarm for alarm, to River's ``PageHinkley(mode="down", alpha=1.0,
+min_instances=1)``. Source: E. S. Page, Continuous inspection schemes, Biometrika 41 (1954); used on the episode return
+by MORPHIN (arXiv 2601.20714).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pydantic import Field
+
+from knowledge.records import Direction
+from mape.config import PartConfig
+
+
+class PageHinkleyConfig(PartConfig):
+    """Options of `PageHinkley`."""
+
+    delta: float = Field(0.5, ge=0, description="fall of the mean that is tolerated, in units of the signal")
+    threshold: float = Field(300.0, gt=0, description="alarm above this statistic (H)")
+
+
+def page_hinkley(
+    x: float, n: float, mean: float, total: float, minimum: float, delta: float
+) -> tuple[float, float, float, float]:
+    """Take one step of the test; return the new (n, mean, total, minimum). The statistic is total - minimum."""
+    n += 1.0
+    mean += (x - mean) / n
+    total += mean - x - delta
+    return n, mean, total, min(minimum, total)
+
+
+class PageHinkley:
+    """Page-Hinkley test on one signal.
+
+    Examples
+    --------
+    >>> test = PageHinkley(PageHinkleyConfig(delta=0.5, threshold=12))
+    >>> [(test.update(x), test.statistic) for x in (10, 10, 10, 0, 0)]
+    [(False, 0.0), (False, 0.0), (False, 0.0), (False, 7.0), (True, 12.5)]
+    """
+
+    Config = PageHinkleyConfig
+    direction: Direction = "down"
+
+    def __init__(self, config: PageHinkleyConfig) -> None:
+        self.config = config
+        self._delta = config.delta
+        self._threshold = config.threshold
+        self.reset()
+
+    @property
+    def statistic(self) -> float:
+        """How far the cumulative sum stands above its minimum."""
+        return self._total - self._minimum
+
+    def update(self, x: float) -> bool:
+        """Take one value; say whether the test alarms."""
+        self._n, self._mean, self._total, self._minimum = page_hinkley(
+            x, self._n, self._mean, self._total, self._minimum, self._delta
+        )
+        return self._total - self._minimum > self._threshold
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._n = self._mean = self._total = self._minimum = 0.0
+
+    def state(self) -> dict[str, float]:
+        """Return the four numbers of the test."""
+        return {"n": self._n, "mean": self._mean, "total": self._total, "minimum": self._minimum}
+
+    def restore(self, state: Any) -> None:
+        """Take up where `state` was given."""
+        numbers = [float(state[key]) for key in ("n", "mean", "total", "minimum")]
+        if not all(math.isfinite(number) for number in numbers):
+            raise ValueError(f"state {state} of a Page-Hinkley test must be finite")
+        self._n, self._mean, self._total, self._minimum = numbers

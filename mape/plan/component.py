@@ -1,0 +1,66 @@
+"""The Plan component."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from knowledge import ChangePlan, ChangeRequest, Knowledge
+from mape.errors import PartError
+from mape.ports import Planner
+
+
+class Plan:
+    """Asks its planner for the next plan, keeps it as the plan in force, and sends it.
+
+    Parameters
+    ----------
+    planner
+        The method.
+    knowledge
+        Given to the planner to read; its entry ``plan`` is written here.
+    send
+        Takes the ChangePlan.
+    """
+
+    def __init__(self, planner: Planner, knowledge: Knowledge, send: Callable[[ChangePlan], object]) -> None:
+        self.planner = planner
+        self._knowledge = knowledge
+        self._send = send
+
+    def start(self, loop: int) -> ChangePlan:
+        """Send plan 0, which starts the run, and return it."""
+        try:
+            plan = self.planner.start(loop)
+        except Exception as error:
+            raise self._failed(0, error) from error
+        self._put(plan)
+        return plan
+
+    def on_request(self, request: ChangeRequest) -> None:
+        """Turn a ChangeRequest into a ChangePlan.
+
+        Raises
+        ------
+        PartError
+            The planner raised, or its exploration rate is outside [0, 1].
+        """
+        try:
+            plan = self.planner.plan(request, self._knowledge)
+        except Exception as error:
+            raise self._failed(request.pass_no, error) from error
+        self._put(plan)
+
+    def _put(self, plan: ChangePlan) -> None:
+        if not 0.0 <= plan.epsilon <= 1.0:
+            raise PartError(
+                f"planner {type(self.planner).__name__} gave epsilon {plan.epsilon!r} for pass {plan.pass_no}; an "
+                "exploration rate is a number in [0, 1]"
+            )
+        self._knowledge.plan = plan
+        self._send(plan)
+
+    def _failed(self, number: int, error: Exception) -> PartError:
+        return PartError(
+            f"planner {type(self.planner).__name__} raised {type(error).__name__}: {error}, at pass {number}. Choose "
+            "another in [plan], or mend this one and run `mapek check` on it."
+        )

@@ -1,0 +1,37 @@
+"""Constant exploration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from mape.config import PartConfig
+
+
+class ConstantConfig(PartConfig):
+    """Options of `Constant`."""
+
+    epsilon: float = Field(0.1, ge=0, le=1, description="exploration rate of every episode")
+
+
+class Constant:
+    """The same exploration rate for ever."""
+
+    Config = ConstantConfig
+
+    def __init__(self, config: ConstantConfig) -> None:
+        self.config = config
+        self.epsilon = config.epsilon
+
+    def advance(self, episode_return: float) -> None:
+        """Do nothing."""
+
+    def reset(self, drift: bool) -> None:
+        """Do nothing."""
+
+    def state(self) -> None:
+        """Return None: there is no state."""
+
+    def restore(self, state: Any) -> None:
+        """Do nothing: there is no state."""

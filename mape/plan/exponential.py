@@ -1,0 +1,64 @@
+"""Exponential exploration schedule (arXiv 2601.20714, Eq. for epsilon).
+
+    epsilon(e) = eps_min + (1 - eps_min) * exp(-decay * e)
+
+`e` counts the episodes since the last response.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pydantic import Field
+
+from mape.config import PartConfig
+
+
+class ExponentialConfig(PartConfig):
+    """Options of `Exponential`."""
+
+    eps_min: float = Field(0.1, ge=0, le=1, description="exploration rate that is approached")
+    decay: float = Field(0.05, ge=0, description="decay per episode")
+
+
+def exponential(counter: float, eps_min: float, decay: float) -> float:
+    """Return the exploration rate, `counter` episodes after the last response.
+
+    >>> [round(exponential(e, 0.1, 0.05), 6) for e in (0, 1, 10, 15, 60, 100)]
+    [1.0, 0.956106, 0.645878, 0.52513, 0.144808, 0.106064]
+    """
+    return eps_min + (1.0 - eps_min) * math.exp(-decay * counter)
+
+
+class Exponential:
+    """Exponential schedule over a counter of episodes."""
+
+    Config: type[ExponentialConfig] = ExponentialConfig
+
+    def __init__(self, config: ExponentialConfig) -> None:
+        self.config = config
+        self._eps_min = config.eps_min
+        self._decay = config.decay
+        self._counter = 0.0
+
+    @property
+    def epsilon(self) -> float:
+        """Exploration rate of the next episode."""
+        return exponential(self._counter, self._eps_min, self._decay)
+
+    def advance(self, episode_return: float) -> None:
+        """Count one episode without a response."""
+        self._counter += 1.0
+
+    def reset(self, drift: bool) -> None:
+        """Explore anew."""
+        self._counter = 0.0
+
+    def state(self) -> Any:
+        """Return the counter."""
+        return {"counter": self._counter}
+
+    def restore(self, state: Any) -> None:
+        """Take up where `state` was given."""
+        self._counter = float(state["counter"])

@@ -1,0 +1,71 @@
+"""Success rule on the exponential schedule: explore fully until the goal is found once, then stop at once.
+
+Once the first drift has been met, at the end of every later episode
+
+    e <- (e + 1) * 15    if the return is positive
+    e <- (e + 1) * 0.6   otherwise
+
+and e <- 0 on a drift. Algorithm 1 of arXiv 2601.20714 does not print it; the authors' published code has it, and
+Table 1 needs it. It fits systems whose return is positive exactly when the goal was reached.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from mape.plan.exponential import Exponential, ExponentialConfig
+
+
+class SuccessConfig(ExponentialConfig):
+    """Options of `Success`."""
+
+    on_success: float = Field(15.0, gt=0, description="factor of the counter after a positive return")
+    on_failure: float = Field(0.6, ge=0, description="factor of the counter after any other return")
+
+
+COUNTER_CAP = 1e6
+"""The counter stops here, where the exponential is 0 for every decay that matters; it would overflow otherwise."""
+
+
+def success_counter(
+    counter: float, episode_return: float, drifted: bool, on_success: float, on_failure: float
+) -> float:
+    """Return the counter after an episode without a drift; before the first drift it just counts."""
+    if not drifted:
+        return counter + 1.0
+    factor = on_success if episode_return > 0.0 else on_failure
+    return min((counter + 1.0) * factor, COUNTER_CAP)
+
+
+class Success(Exponential):
+    """Exponential schedule whose counter follows the success rule after the first drift."""
+
+    Config = SuccessConfig
+
+    def __init__(self, config: SuccessConfig) -> None:
+        super().__init__(config)
+        self._on_success = config.on_success
+        self._on_failure = config.on_failure
+        self._drifted = False
+
+    def advance(self, episode_return: float) -> None:
+        """Count one episode without a response, by the success rule."""
+        self._counter = success_counter(
+            self._counter, episode_return, self._drifted, self._on_success, self._on_failure
+        )
+
+    def reset(self, drift: bool) -> None:
+        """Explore anew; from the first drift on the success rule holds."""
+        super().reset(drift)
+        self._drifted = self._drifted or drift
+
+    def state(self) -> Any:
+        """Return the counter and whether a drift has been met."""
+        return {"counter": self._counter, "drifted": self._drifted}
+
+    def restore(self, state: Any) -> None:
+        """Take up where `state` was given."""
+        super().restore(state)
+        self._drifted = bool(state["drifted"])

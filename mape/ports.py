@@ -1,0 +1,158 @@
+"""Every contract of the loop on one screen.
+
+A part is any object with these members; nothing is inherited. `mape.testing` checks them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from knowledge import ChangePlan, ChangeRequest, Knowledge, Record, Symptom
+from knowledge.records import Direction
+
+Json = Any
+"""What the standard library's JSON writes: None, bool, int, float, str, list, dict."""
+
+
+class Detector(Protocol):
+    """Watches one signal for a change of its distribution; fed once per pass."""
+
+    direction: Direction
+
+    @property
+    def statistic(self) -> float | None: ...
+    def update(self, x: float) -> bool: ...
+    def reset(self) -> None: ...
+    def state(self) -> Json: ...
+    def restore(self, state: Json) -> None: ...
+
+
+class Analyzer(Protocol):
+    """Turns a symptom into a change request, or into one that says "nothing changed"."""
+
+    def analyze(self, symptom: Symptom) -> ChangeRequest: ...
+    def state(self) -> Json: ...
+    def restore(self, state: Json) -> None: ...
+
+
+class Schedule(Protocol):
+    """Exploration rate over the episodes since the last response."""
+
+    @property
+    def epsilon(self) -> float: ...
+    def advance(self, episode_return: float) -> None: ...
+    def reset(self, drift: bool) -> None: ...
+    def state(self) -> Json: ...
+    def restore(self, state: Json) -> None: ...
+
+
+class Planner(Protocol):
+    """Answers a change request with the plan of the next episode."""
+
+    def start(self, loop: int) -> ChangePlan: ...
+    def plan(self, request: ChangeRequest, knowledge: Knowledge) -> ChangePlan: ...
+    def state(self) -> Json: ...
+    def restore(self, state: Json) -> None: ...
+
+
+class Learner(Protocol):
+    """Two pure rules that Numba can compile, and the names of the learning-rate parameters that they take.
+
+    `value(q, rows, count, state, epsilon)` is the worth of a state, from which the TD target bootstraps, over the rows
+    ``rows[:count]`` of ``q``; `step_size(td_error, rate)` is the learning rate of one update.
+    """
+
+    rate_names: tuple[str, ...]
+    discount: float
+    bootstrap_terminal: bool
+    value: Callable[..., float]
+    step_size: Callable[..., float]
+
+
+class StepRules(Protocol):
+    """The compilable face of a managed system: pure rules over `params`, an immutable named tuple.
+
+    The rules take their randomness as uniforms on [0, 1): `reset` reads ``draws[at : at + reset_draws]``, a `step`
+    ``draws[at : at + step_draws]``. A step adds its values of the system's own signals to `context`.
+    """
+
+    @property
+    def params(self) -> Any: ...
+    @property
+    def phase(self) -> Callable[..., int]: ...  # (params, episode) -> phase
+    @property
+    def reset(self) -> Callable[..., int]: ...  # (params, phase, draws, at) -> state
+    @property
+    def step(self) -> Callable[..., tuple[int, float, bool]]: ...  # (params, phase, state, action, draws, at, context)
+    @property
+    def explorable(self) -> Callable[..., bool]: ...  # (params, phase, state, action)
+    @property
+    def windows(self) -> npt.NDArray[np.int64]: ...  # (actions, 2): first and last episode of each action
+    @property
+    def reset_draws(self) -> int: ...
+    @property
+    def step_draws(self) -> int: ...
+
+
+class Episode(NamedTuple):
+    """What a managed system is told when an episode begins."""
+
+    number: int
+    seed: int
+    uniforms: npt.NDArray[np.float64]
+
+
+class ManagedSystem(Protocol):
+    """What Execute drives. States are indices below `n_states`, actions stable integers below `max_actions`."""
+
+    name: str
+    n_states: int
+    max_steps: int
+    signal_names: tuple[str, ...]
+    drifts: tuple[int, ...]  # episodes from which a new regime holds, where known; for evaluation only
+    draws: tuple[int, int]  # uniforms that a reset and a step take from the pass's block
+    rules: StepRules | None
+
+    def available(self, episode: int) -> tuple[int, ...] | None:
+        """Say which actions episode `episode` will offer, or None where only its reset can tell."""
+        ...
+
+    def begin(self, episode: Episode) -> tuple[int, tuple[int, ...]]:
+        """Reset; return the first state and the available actions."""
+        ...
+
+    def step(self, action: int, context: npt.NDArray[np.float64]) -> tuple[int, float, bool, bool]:
+        """Act; return next state, reward, terminated, truncated; add the step's own signals to `context`."""
+        ...
+
+    def explorable(self, action: int) -> bool:
+        """Whether exploration may try `action` in the present state."""
+        ...
+
+    def enable(self, actions: tuple[int, ...]) -> None:
+        """Switch reserve actions on, from the next episode."""
+        ...
+
+    def close(self) -> None:
+        """Release what the system holds."""
+        ...
+
+
+class Bus(Protocol):
+    """Takes records to Knowledge, which appends them, and hands what was appended to the subscribers.
+
+    Records arrive in the order of the log, each once; a handler runs to completion before the next record is
+    delivered, and may send. What a handler raises comes out of `run`.
+    """
+
+    def subscribe(self, kind: type[Record], handler: Callable[[Any], object]) -> None: ...
+    def send(self, record: Record) -> None: ...
+    def run(self) -> int: ...  # deliver until nothing waits; the number delivered
+    def close(self) -> None: ...
+
+
+SystemFactory = Callable[[Mapping[str, Any]], ManagedSystem]

@@ -1,0 +1,129 @@
+"""Parts by name: short names for what is built in, ``"module:Class"`` for everything else, imported when used."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import os
+import sys
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel, ValidationError
+
+from mape.config import PartSpec, explain_options
+from mape.errors import ConfigError, UnknownName
+
+
+class Entry(NamedTuple):
+    """Where a part is, and what it is in one line."""
+
+    target: str
+    summary: str
+
+
+PARTS: dict[str, dict[str, Entry]] = {
+    "detector": {
+        "page_hinkley": Entry("mape.monitor.page_hinkley:PageHinkley", "one-sided test for a fall of the mean"),
+        "two_window": Entry("mape.monitor.two_window:TwoWindow", "z-test of two sliding windows, both sides"),
+        "oracle": Entry("mape.monitor.oracle:Oracle", "is told the episodes of the drifts; the upper bound"),
+    },
+    "analyzer": {
+        "changes": Entry("mape.analyze.changes:Changes", "every alarm is a drift; action sets are compared"),
+    },
+    "planner": {
+        "morphin": Entry("mape.plan.morphin:Morphin", "resets exploration on change; learning rate by TD error"),
+        "q_learning": Entry("mape.plan.q_learning:QLearningPlanner", "fixed learning rate, no response to change"),
+    },
+    "schedule": {
+        "exponential": Entry("mape.plan.exponential:Exponential", "exponential decay since the last response"),
+        "success": Entry("mape.plan.success:Success", "exponential, and the success rule after the first drift"),
+        "geometric": Entry("mape.plan.geometric:Geometric", "a factor per episode since the last response"),
+        "constant": Entry("mape.plan.constant:Constant", "one exploration rate for ever"),
+    },
+    "learner": {
+        "q_learning": Entry("mape.execute.rules:QLearning", "Q-learning with the step size alpha*"),
+        "expected_sarsa": Entry("mape.execute.rules:ExpectedSarsa", "Expected Sarsa with the step size alpha*"),
+    },
+}
+
+
+def register(kind: str, name: str, target: str, summary: str) -> None:
+    """Give a part a short name; for adapters, at import."""
+    PARTS.setdefault(kind, {})[name] = Entry(target, summary)
+
+
+def find(kind: str, name: str) -> Any:
+    """Return the class behind a short name or ``"module:Class"``.
+
+    Raises
+    ------
+    UnknownName
+        No such short name, module or class.
+    """
+    entries = PARTS[kind]
+    if name in entries:
+        target = entries[name].target
+    elif ":" in name:
+        target = name
+    else:
+        raise UnknownName(kind, name, entries, 'A part of your own is named "module:Class".')
+    module_name, _, attribute = target.partition(":")
+    if os.getcwd() not in sys.path:
+        # The console script does not look where the user stands; `python -m` does.
+        sys.path.append(os.getcwd())
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (module_name == error.name or module_name.startswith(error.name + ".")):
+            raise UnknownName(
+                kind, name, entries, f"There is no module {error.name!r} on the path or in this folder."
+            ) from None
+        raise ConfigError(f"{kind} {name!r} needs the package {error.name!r}, which is not installed") from error
+    except Exception as error:
+        raise ConfigError(f"{kind} {name!r}: its module raised {type(error).__name__}: {error}") from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError:
+        classes = [n for n, value in vars(module).items() if inspect.isclass(value) and value.__module__ == module_name]
+        raise UnknownName(f"class of {module_name}", attribute, classes) from None
+
+
+def options_of(kind: str, spec: PartSpec, where: str) -> tuple[Any, Any]:
+    """Return the class of a part, and its options: a checked model, or a table where the class declares none.
+
+    Raises
+    ------
+    ConfigError
+        An option is not legal.
+    """
+    part = find(kind, spec.name)
+    model = getattr(part, "Config", None)
+    if isinstance(model, type) and issubclass(model, BaseModel):
+        try:
+            return part, model.model_validate_json(json.dumps(spec.options))
+        except ValidationError as error:
+            raise ConfigError(explain_options(error, where, model.model_fields)) from None
+    return part, spec.options
+
+
+def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
+    """Make a part; `extra` (a planner's schedule) is passed on by name where the part takes it.
+
+    Raises
+    ------
+    ConfigError
+        The options are not legal, or the part cannot be made.
+    """
+    part, options = options_of(kind, spec, kind)
+    try:
+        if isinstance(options, BaseModel):
+            return part(options, **extra)
+        taken = {name: value for name, value in extra.items() if name in inspect.signature(part).parameters}
+        return part(**options, **taken)
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f"{kind} {spec.name!r} cannot be made with {options or 'no options'}: {type(error).__name__}: {error}"
+        ) from error
