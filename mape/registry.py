@@ -37,7 +37,7 @@ PARTS: dict[str, dict[str, Entry]] = {
     },
     "schedule": {
         "exponential": Entry("mape.plan.exponential:Exponential", "exponential decay since the last response"),
-        "success": Entry("mape.plan.success:Success", "exponential, and the success rule after the first drift"),
+        "success": Entry("mape.plan.success:Success", "exponential, and the success rule after the first response"),
         "geometric": Entry("mape.plan.geometric:Geometric", "a factor per episode since the last response"),
         "constant": Entry("mape.plan.constant:Constant", "one exploration rate for ever"),
     },

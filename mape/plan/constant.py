@@ -27,7 +27,7 @@ class Constant:
     def advance(self, episode_return: float) -> None:
         """Do nothing."""
 
-    def reset(self, drift: bool) -> None:
+    def reset(self) -> None:
         """Do nothing."""
 
     def state(self) -> None:

@@ -51,7 +51,7 @@ class Exponential:
         """Count one episode without a response."""
         self._counter += 1.0
 
-    def reset(self, drift: bool) -> None:
+    def reset(self) -> None:
         """Explore anew."""
         self._counter = 0.0
 

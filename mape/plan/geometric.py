@@ -45,7 +45,7 @@ class Geometric:
         """Count one episode without a response."""
         self._epsilon = geometric(self._epsilon, self._eps_min, self._factor)
 
-    def reset(self, drift: bool) -> None:
+    def reset(self) -> None:
         """Explore anew."""
         self._epsilon = 1.0
 

@@ -78,7 +78,7 @@ class Morphin:
             # A new action changes what returns are possible: the test's past is no longer the null hypothesis.
             reset = bool((request.added and self._added) or (drop and self._removed))
             if reset or (drifts and self._drift):
-                self.schedule.reset(bool(drifts))
+                self.schedule.reset()
             else:
                 self.schedule.advance(signals["return"])
         else:

@@ -1,11 +1,11 @@
 """Success rule on the exponential schedule: explore fully until the goal is found once, then stop at once.
 
-Once the first drift has been met, at the end of every later episode
+Once there has been a response (to a drift or, in the same way, to a new action), at the end of every later episode
 
     e <- (e + 1) * 15    if the return is positive
     e <- (e + 1) * 0.6   otherwise
 
-and e <- 0 on a drift. Algorithm 1 of arXiv 2601.20714 does not print it; the authors' published code has it, and
+and e <- 0 on a response. Algorithm 1 of arXiv 2601.20714 does not print it; the authors' published code has it, and
 Table 1 needs it. It fits systems whose return is positive exactly when the goal was reached.
 """
 
@@ -30,17 +30,17 @@ COUNTER_CAP = 1e6
 
 
 def success_counter(
-    counter: float, episode_return: float, drifted: bool, on_success: float, on_failure: float
+    counter: float, episode_return: float, responded: bool, on_success: float, on_failure: float
 ) -> float:
-    """Return the counter after an episode without a drift; before the first drift it just counts."""
-    if not drifted:
+    """Return the counter after an episode without a drift; before the first response it just counts."""
+    if not responded:
         return counter + 1.0
     factor = on_success if episode_return > 0.0 else on_failure
     return min((counter + 1.0) * factor, COUNTER_CAP)
 
 
 class Success(Exponential):
-    """Exponential schedule whose counter follows the success rule after the first drift."""
+    """Exponential schedule whose counter follows the success rule after the first response."""
 
     Config = SuccessConfig
 
@@ -48,24 +48,24 @@ class Success(Exponential):
         super().__init__(config)
         self._on_success = config.on_success
         self._on_failure = config.on_failure
-        self._drifted = False
+        self._responded = False
 
     def advance(self, episode_return: float) -> None:
         """Count one episode without a response, by the success rule."""
         self._counter = success_counter(
-            self._counter, episode_return, self._drifted, self._on_success, self._on_failure
+            self._counter, episode_return, self._responded, self._on_success, self._on_failure
         )
 
-    def reset(self, drift: bool) -> None:
-        """Explore anew; from the first drift on the success rule holds."""
-        super().reset(drift)
-        self._drifted = self._drifted or drift
+    def reset(self) -> None:
+        """Explore anew; from the first response on the success rule holds."""
+        super().reset()
+        self._responded = True
 
     def state(self) -> Any:
-        """Return the counter and whether a drift has been met."""
-        return {"counter": self._counter, "drifted": self._drifted}
+        """Return the counter and whether there has been a response."""
+        return {"counter": self._counter, "responded": self._responded}
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
         super().restore(state)
-        self._drifted = bool(state["drifted"])
+        self._responded = bool(state["responded"])
