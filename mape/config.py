@@ -1,4 +1,4 @@
-"""Configs: TOML -> frozen pydantic models. An experiment is data: what runs, how long, which seeds.
+"""Configs: TOML (or JSON) -> frozen pydantic models. An experiment is data: what runs, how long, which seeds.
 
 A file may name another one to start from (``extends``), and hold overlays: ``[profiles.NAME]`` and ``[agents.NAME]``
 are tables laid over the rest when that profile or agent is chosen. Overrides (``plan.alpha=0.2``) come last. A table
@@ -193,16 +193,20 @@ def overlays_of(path: str | Path, kind: str) -> list[str]:
 
 
 def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
-    """Read a TOML file and what it extends."""
+    """Read a TOML or JSON file and what it extends."""
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except FileNotFoundError:
         raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in the folder examples") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}") from None
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise ConfigError(f"{path} is not valid {kind}: {error}") from None
+    if not isinstance(table, dict):
+        raise ConfigError(f"{path} holds no table")
     base = table.pop("extends", None)
     if base is None:
         return table

@@ -73,6 +73,7 @@ class GymnasiumSystem:
         self.signal_names: tuple[str, ...] = tuple(getattr(rules, "signal_names", getattr(self._base, "signal_names", ())))
         self.drifts: tuple[int, ...] = tuple(getattr(rules, "drifts", getattr(self._base, "drifts", ())))
         self.draws: tuple[int, int] = (rules.reset_draws, rules.step_draws) if rules is not None else (0, 0)
+        self._block = getattr(rules, "episode_draws", 0)
         self.first_state = 0
         self._mask: npt.NDArray[np.int8] | None = None
         self._windows: tuple[int, int, tuple[int, ...]] | None = None
@@ -93,7 +94,10 @@ class GymnasiumSystem:
         """Reset the environment for an episode; return the first state and the available actions."""
         options: dict[str, Any] = {"episode": episode.number}
         if self.rules is not None:
-            options["uniforms"] = episode.uniforms
+            # Where the config's step cap is below the system's own, the rest of the block is never reached.
+            uniforms = np.zeros(max(self._block, len(episode.uniforms)))
+            uniforms[: len(episode.uniforms)] = episode.uniforms
+            options["uniforms"] = uniforms
         seen, info = self.env.reset(seed=episode.seed, options=options)
         self._see_mask(info)
         self.first_state = self._index(seen)

@@ -70,6 +70,7 @@ class Execute:
         self.passes = 0
         self._knowledge = knowledge
         self._send = send
+        self.trial = trial
         self._loop = loop
         self._seeds = (seed, loop, trial)
         self._mask_greedy = mask_greedy

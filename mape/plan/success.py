@@ -32,7 +32,7 @@ COUNTER_CAP = 1e6
 def success_counter(
     counter: float, episode_return: float, responded: bool, on_success: float, on_failure: float
 ) -> float:
-    """Return the counter after an episode without a drift; before the first response it just counts."""
+    """Return the counter after an episode without a response; before the first response it just counts."""
     if not responded:
         return counter + 1.0
     factor = on_success if episode_return > 0.0 else on_failure

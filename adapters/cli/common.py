@@ -1,0 +1,81 @@
+"""What the commands share: configs with the options of the command line, folders, and the output of results."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from adapters import detectors
+from adapters.experiments.runner import announce_compilation
+from adapters.experiments.statistics import finite
+from adapters.results import RunFolder
+from adapters.results.files import write_json
+from adapters.results.folder import default_path
+from mape.config import Config, load
+
+
+def prepare() -> None:
+    """Make the adapters' parts known by name, and long compilations heard."""
+    detectors.register()
+    announce_compilation()
+
+
+def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = None, **defaults: Any) -> Config:
+    """Load a config with the command line's profile, overrides, seed and trials laid over it.
+
+    `defaults` fill what the command line leaves open.
+    """
+    overrides = list(chosen.overrides)
+    for key in ("seed", "trials"):
+        value = getattr(chosen, key, None)
+        value = defaults.get(key) if value is None else value
+        if value is not None:
+            overrides.append(f"{key}={value}")
+    return load(path, profile=chosen.profile or defaults.get("profile"), agent=agent, overrides=overrides)
+
+
+def open_folder(chosen: argparse.Namespace, kind: str, name: str, configs: Mapping[str, Config]) -> RunFolder:
+    """Open the folder that the command line names, or a new one, and say if it is continued."""
+    check_json_target(chosen)
+    folder = RunFolder(Path(chosen.out) if chosen.out else default_path(name), kind, configs)
+    if folder.resumed:
+        say(chosen, f"continuing in {folder.path}: {folder.resumed} trials are finished already")
+    return folder
+
+
+def check_json_target(chosen: argparse.Namespace) -> None:
+    """Refuse a --json that cannot be written before the work is done, not after."""
+    from mape.errors import ConfigError
+
+    if chosen.json in (None, "-"):
+        return
+    path = Path(chosen.json)
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise ConfigError(f"--json {chosen.json!r}: there is no folder {str(path.parent)!r} to hold it, or it is a folder")
+
+
+def say(chosen: argparse.Namespace, text: str = "") -> None:
+    """Print for people: on standard error where standard output carries JSON."""
+    print(text, file=sys.stderr if chosen.json == "-" else sys.stdout)
+
+
+def finish(chosen: argparse.Namespace, folder: RunFolder, result: Mapping[str, Any], figures: list[Path]) -> None:
+    """Write the result beside the tables and where --json wants it, and say where all is."""
+    result = finite(dict(result))
+    folder.finish(result)
+    if chosen.json == "-":
+        print(json.dumps(result, indent=2, allow_nan=False))
+    elif chosen.json:
+        target = Path(chosen.json)
+        if target.exists() and not target.is_file():  # a device or a pipe cannot be replaced
+            with open(target, "w", encoding="utf-8") as file:
+                json.dump(result, file, indent=2, allow_nan=False)
+        else:
+            write_json(target, result)
+    if figures:
+        say(chosen, f"figures:  {folder.path / 'figures'} ({', '.join(sorted({p.stem for p in figures}))}; PNG and PDF)")
+    say(chosen, f"results:  {folder.path}")

@@ -1,0 +1,276 @@
+"""`mapek reproduce`: the paper's experiments beside the paper's numbers."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.experiments import paper
+from adapters.experiments.metrics import (
+    Detection,
+    Stage,
+    convergence,
+    detection,
+    greedy_length,
+    trailing_mean,
+)
+from adapters.experiments.runner import experiment_config, run_agents
+from adapters.experiments.statistics import Comparison, compare, summary
+from adapters.results import RunFolder
+from adapters.systems import make_system
+from mape.config import Config
+from mape.trials import TrialResult, combined_hash
+
+Results = dict[str, list[TrialResult]]
+
+
+def execute(chosen: argparse.Namespace) -> int:
+    """Run the command."""
+    prepare()
+    kind, file, agents, trials, profile, trace = _EXPERIMENTS[chosen.experiment]
+    path = experiment_config(file)
+    profile = chosen.profile or profile
+    configs = {agent: config_of(path, chosen, agent, trials=trials, profile=profile) for agent in agents}
+    traced = None if chosen.no_figures or trace is None else (1, configs[agents[0]].episodes)
+    with open_folder(chosen, f"reproduce {chosen.experiment}", chosen.experiment, configs) as folder:
+        results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet)
+        say(chosen)
+        result = {"experiment": chosen.experiment, "profile": profile, "trials": configs[agents[0]].trials}
+        result |= kind(chosen, folder, configs, results)
+        result |= {
+            "log_sha256": combined_hash(r.log_sha256 for agent in agents for r in results[agent]),
+            "q_table_sha256": combined_hash(r.q_table_sha256 for agent in agents for r in results[agent]),
+        }
+        say(chosen, f"\nlog:      {result['log_sha256']}")
+        say(chosen, f"Q-tables: {result['q_table_sha256']}")
+        figures: list[Path] = []
+        if not chosen.no_figures:
+            from adapters.experiments import pictures
+
+            figures = getattr(pictures, f"pictures_of_{chosen.experiment}")(folder, results)
+        finish(chosen, folder, result, figures)
+    return 0
+
+
+def _drifts(config: Config) -> tuple[int, ...]:
+    system = make_system(config.system)
+    system.close()
+    return system.drifts
+
+
+def _alarms(results: list[TrialResult]) -> list[tuple[int, ...]]:
+    return [r.alarms for r in results]
+
+
+# Table 1
+
+
+def _table1(
+    chosen: argparse.Namespace, folder: RunFolder, configs: Mapping[str, Config], results: Results
+) -> dict[str, Any]:
+    drifts = _drifts(configs["morphin"])
+    totals = {agent: np.array([r.total_steps for r in found], dtype=float) for agent, found in results.items()}
+    by_stage = {agent: convergence(folder.episodes(agent, "q_change")["q_change"], drifts) for agent in configs}
+    against = compare(totals["morphin"], totals["q_learning"])
+    met, initial = detection(_alarms(results["morphin"]), drifts, configs["morphin"].episodes, window=300)
+
+    trials = configs["morphin"].trials
+    profile = chosen.profile or "reference"
+    say(chosen, f"Table 1 of arXiv 2601.20714, profile {profile}, {trials:,} trial{'s' * (trials > 1)} per agent")
+    for agent, title in (("morphin", "MORPHIN"), ("q_learning", "Q-learning")):
+        say(chosen, f"\n{title:<23}{'found':>20}{'95 % interval':>24}{'paper':>22}{'z':>7}")
+        _line(chosen, "total steps", totals[agent], paper.TABLE1_TOTAL[agent])
+        for i, stage in enumerate(by_stage[agent]):
+            printed = paper.TABLE1_STAGES[agent][i] if i < 3 else None
+            _stage_line(chosen, i, stage, printed, "-" if i < 3 else "")
+    _print_comparison(chosen, against)
+    say(chosen, "\nDetection (Page-Hinkley on the return, MORPHIN)")
+    say(chosen, f"{'drift at episode':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}")
+    say(chosen, f"{'(before the first)':<23}{'':>10}{'':>14}{initial:>22.3f}")
+    for drift, found in zip(drifts, met, strict=False):
+        _detection_line(chosen, drift, found)
+    if profile == "paper":
+        say(
+            chosen,
+            "\nProfile paper is Algorithm 1 as printed. It does not give the paper's Table 1; the profile reference adds "
+            "the success rule of the authors' published code, and does.",
+        )
+    say(
+        chosen,
+        "\nconverged: first episode of the stage at whose end max|change of Q| < 0.01, counted only where the stage "
+        "before\nconverged; a trial that did not converge is censored, not late. z: difference in the paper's standard "
+        "deviations\nof one trial. What the ratio does not say: it is mostly a weak baseline (see README, What is honest "
+        "to claim).",
+    )
+    return {
+        "agents": {
+            agent: {
+                "total_steps": {"mean": totals[agent].mean(), "sd": _sd(totals[agent])},
+                "stages": [
+                    {
+                        "share": stage.share,
+                        "mean": stage.converged.mean() if len(stage.converged) else None,
+                        "sd": _sd(stage.converged),
+                        "restricted_mean": stage.restricted_mean(),
+                    }
+                    for stage in by_stage[agent]
+                ],
+            }
+            for agent in configs
+        },
+        "ratio": against.ratio,
+        "ratio_interval": against.ratio_interval,
+        "welch": {"t": against.t, "df": against.df, "p": against.p},
+        "hedges_g": against.hedges_g,
+        "detection": [found._asdict() for found in met],
+        "detection_initial": initial,
+    }
+
+
+def _line(chosen: argparse.Namespace, name: str, values: npt.NDArray[Any], printed: Any, missing: str = "") -> None:
+    found = summary(values)
+    spread = "" if found.sd is None else f" ± {found.sd:,.2f}"
+    interval = "" if found.interval is None else f"[{found.interval[0]:,.2f}, {found.interval[1]:,.2f}]"
+    theirs, z = missing, ""
+    if printed is not None:
+        theirs = f"{printed.mean:,.2f} ± {printed.sd:,.2f}"
+        z = f"{(found.mean - printed.mean) / printed.sd:+.2f}"
+    say(chosen, f"  {name:<21}{f'{found.mean:,.2f}{spread}':>20}{interval:>24}{theirs:>22}{z:>7}")
+
+
+def _stage_line(chosen: argparse.Namespace, i: int, stage: Stage, printed: Any, missing: str) -> None:
+    name = f"stage {i + 1}, {100 * stage.share:.4g} %"
+    if len(stage.converged):
+        _line(chosen, name, stage.converged, printed, missing)
+    else:
+        say(chosen, f"  {name:<21}{'-':>20}{'':>24}{missing:>22}")
+
+
+def _print_comparison(chosen: argparse.Namespace, against: Comparison) -> None:
+    ratio = "-" if against.ratio is None else f"{against.ratio:.3f}"
+    interval = ""
+    if against.ratio_interval is not None:
+        interval = f", 95 % bootstrap interval [{against.ratio_interval[0]:.3f}, {against.ratio_interval[1]:.3f}]"
+    say(chosen, f"\nratio of total steps, Q-learning / MORPHIN: {ratio}{interval}; paper {paper.TABLE1_RATIO}")
+    if against.t is not None:
+        p = f"p = {against.p:.3g}" if against.p else "p < 1e-300"
+        say(chosen, f"Welch t = {against.t:.1f}, df = {against.df:.0f}, {p}; effect size g = {against.hedges_g:.1f}")
+
+
+def _detection_line(chosen: argparse.Namespace, drift: int, found: Detection) -> None:
+    delay = "-" if found.delay_mean is None else f"{found.delay_mean:.2f}"
+    say(chosen, f"{drift:<23}{found.recall:>10.3f}{delay:>14}{found.false_alarms:>22.3f}")
+
+
+def _sd(values: npt.NDArray[Any]) -> float | None:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+# Traffic
+
+
+def _traffic(
+    chosen: argparse.Namespace, folder: RunFolder, configs: Mapping[str, Config], results: Results
+) -> dict[str, Any]:
+    episodes = configs["morphin"].episodes
+    drifts = tuple(d for d in _drifts(configs["morphin"]) if d <= episodes)
+    points = [e for e in paper.TRAFFIC_EPISODES if e <= episodes] or [episodes]
+    say(chosen, f"Traffic, {configs['morphin'].trials:,} trials per agent: mean return of the last 500 episodes")
+    say(chosen, f"\n{'at episode':<30}" + "".join(f"{e:>9}" for e in points))
+    found: dict[str, Any] = {}
+    for agent, config in configs.items():
+        returns = folder.episodes(agent, "return")["return"]
+        curve = [summary(trailing_mean(returns, 500, e)) for e in points]
+        say(chosen, f"{agent:<22}{'found':<8}" + "".join(f"{c.mean:>9.1f}" for c in curve))
+        if all(c.interval is not None for c in curve):
+            say(chosen, f"{'':<22}{'± 95 %':<8}" + "".join(f"{_half(c.interval):>9.1f}" for c in curve))
+        by_episode = dict(zip(paper.TRAFFIC_EPISODES, paper.TRAFFIC[agent], strict=True))
+        say(chosen, f"{'':<22}{'target':<8}" + "".join(f"{by_episode.get(e, float('nan')):>9}" for e in points))
+        met, initial = detection(_alarms(results[agent]), drifts, config.episodes, window=500)
+        found[agent] = {
+            "curve": {str(e): c.mean for e, c in zip(points, curve, strict=True)},
+            "detection": [d._asdict() for d in met],
+            "detection_initial": initial,
+        }
+    say(chosen, f"\nDetection by Page-Hinkley\n{'agent, drift at':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}")
+    for agent in configs:
+        if configs[agent].monitor.detectors:
+            say(chosen, agent)
+            for drift, one in zip(drifts, found[agent]["detection"], strict=True):
+                _detection_line(chosen, drift, Detection(**one))
+    say(
+        chosen,
+        "\nDrift 2 raises the reward; a test for falls cannot see it. Q-learning that is handed the same five actions "
+        "does\nbetter than MORPHIN after drift 1: the gain is the actions, and a full reset of exploration costs more "
+        "than it finds.",
+    )
+    return {"agents": found}
+
+
+def _half(interval: Any) -> float:
+    return float(interval[1] - interval[0]) / 2
+
+
+# Jump
+
+
+def _jump(
+    chosen: argparse.Namespace, folder: RunFolder, configs: Mapping[str, Config], results: Results
+) -> dict[str, Any]:
+    config = configs["morphin"]
+    system = make_system(config.system)
+    change = int(config.system.options.get("jump_from") or config.episodes)
+    before_at, after_at = (max(1, change - 20), change - 1), (max(1, config.episodes - 19), config.episodes)
+    optimum = shortest_path(system, config.episodes)
+    say(chosen, f"Jump, {config.trials:,} trials per agent; the shortest path at the end has {optimum} steps")
+    say(chosen, f"\n{'mean steps over episodes':<26}{'':<8}{'%d-%d' % before_at:>10}{'%d-%d' % after_at:>10}{'optimal':>10}")
+    found: dict[str, Any] = {}
+    for agent in configs:
+        steps = folder.episodes(agent, "steps")["steps"].astype(float)
+        means = [float(steps[:, first - 1 : last].mean()) for first, last in (before_at, after_at)]
+        tables = folder.q_tables(agent)
+        available = system.available(config.episodes) or ()
+        lengths = [greedy_length(q, ids, system.rules, config.episodes, available) for q, ids in tables.values()]
+        share = float(np.mean([length == optimum for length in lengths]))
+        say(chosen, f"{agent:<26}{'found':<8}{means[0]:>10.2f}{means[1]:>10.2f}{share:>10.3f}")
+        target = paper.JUMP[agent]
+        say(chosen, f"{'':<26}{'target':<8}{target[0]:>10.2f}{target[1]:>10.2f}{target[2]:>10.3f}")
+        found[agent] = {"steps_before": means[0], "steps_after": means[1], "optimal_share": share}
+    system.close()
+    say(chosen, "\noptimal: share of trials whose greedy path at the end is a shortest one.")
+    return {"agents": found, "shortest_path": optimum}
+
+
+def shortest_path(system: Any, episode: int) -> int | None:
+    """Return the number of steps of a shortest path to a terminal state, by breadth-first search over the rules."""
+    rules = system.rules
+    draws = np.zeros(rules.reset_draws + rules.step_draws + 1)
+    context = np.zeros(len(rules.signal_names))
+    phase = rules.phase(rules.params, episode)
+    frontier = {rules.reset(rules.params, phase, draws, 0)}
+    seen = set(frontier)
+    for length in range(1, system.n_states + 1):
+        reached = set()
+        for state in frontier:
+            for action in system.available(episode) or ():
+                following, _, terminated = rules.step(rules.params, phase, state, action, draws, 0, context)
+                if terminated:
+                    return length
+                reached.add(following)
+        frontier = reached - seen
+        seen |= frontier
+    return None
+
+
+Kind = Callable[[argparse.Namespace, RunFolder, Mapping[str, Config], Results], dict[str, Any]]
+_EXPERIMENTS: dict[str, tuple[Kind, str, tuple[str, ...], int, str | None, bool | None]] = {
+    "table1": (_table1, "gridworld_goals", ("morphin", "q_learning"), 1000, "reference", True),
+    "traffic": (_traffic, "traffic", ("morphin", "q_learning", "same_actions", "three_actions"), 200, None, None),
+    "jump": (_jump, "jump", ("morphin", "success_rule", "fixed_alpha", "q_learning"), 1000, None, None),
+}

@@ -1,0 +1,100 @@
+"""`mapek run`: one config, one agent, any number of trials."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.cli.sentences import sentence
+from adapters.experiments.runner import run_agents
+from adapters.experiments.statistics import summary
+from knowledge import STAGES, Record
+from mape.config import Config
+from mape.errors import ConfigError
+from mape.loop import Loop
+from mape.trials import TrialResult, combined_hash
+
+
+def execute(chosen: argparse.Namespace) -> int:
+    """Run the command."""
+    prepare()
+    config = config_of(chosen.config, chosen, chosen.agent)
+    label = chosen.agent or config.name
+    for option, span in (("--show", chosen.show), ("--trace", chosen.trace)):
+        if span is not None and span[1] > config.episodes:
+            raise ConfigError(f"{option} {span[0]}:{span[1]} goes beyond the run's {config.episodes} episodes")
+    watch = None if chosen.show is None else _shower(chosen, *chosen.show)
+    with open_folder(chosen, "run", config.name, {label: config}) as folder:
+        results = run_agents(
+            {label: config}, folder, workers=chosen.workers, trace=chosen.trace, quiet=chosen.quiet, prepare=watch
+        )[label]
+        result = as_json(config, results)
+        _report(chosen, config, results, folder.episodes(label, "return", "steps"))
+        figures = []
+        if not chosen.no_figures:
+            from adapters.experiments.pictures import pictures_of_run
+
+            figures = pictures_of_run(folder, label)
+        finish(chosen, folder, result, figures)
+    return 0
+
+
+def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
+    """Return what `run --json` writes."""
+    return {
+        "name": config.name,
+        "passes": config.episodes,
+        "seed": config.seed,
+        "trials": [
+            {
+                "trial": r.trial,
+                "alarms": list(r.alarms),
+                "total_steps": r.total_steps,
+                "log_sha256": r.log_sha256,
+                "q_table_sha256": r.q_table_sha256,
+            }
+            for r in results
+        ],
+        "log_sha256": combined_hash(r.log_sha256 for r in results),
+        "q_table_sha256": combined_hash(r.q_table_sha256 for r in results),
+    }
+
+
+def _report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], episodes: dict[str, Any]) -> None:
+    tail = min(100, config.episodes)
+    returns = episodes["return"][:, -tail:].mean(axis=1)
+    steps = summary(np.array([r.total_steps for r in results]))
+    late = summary(returns)
+    say(chosen, f"{config.name}: {config.description or config.system.id}")
+    say(chosen, f"episodes: {config.episodes:,}, trials: {config.trials:,}, seed: {config.seed}")
+    say(chosen, f"steps:    {_with_sd(steps)} in total")
+    say(chosen, f"return:   {_with_sd(late)}, mean of the last {tail} episodes")
+    if config.trials == 1:
+        alarms = ", ".join(map(str, results[0].alarms)) or "none"
+        say(chosen, f"alarms:   {alarms}" + (" (episodes)" if results[0].alarms else ""))
+    else:
+        say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per trial")
+    say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)}")
+    say(chosen, f"Q-table:  {combined_hash(r.q_table_sha256 for r in results)}")
+
+
+def _with_sd(found: Any) -> str:
+    return f"{found.mean:,.2f}" if found.sd is None else f"{found.mean:,.2f} ± {found.sd:,.2f}"
+
+
+def _shower(chosen: argparse.Namespace, first: int, last: int) -> Any:
+    def show(record: Record) -> None:
+        if first <= record.pass_no <= last:
+            if type(record) is STAGES[0]:
+                say(chosen, f"--- pass {record.pass_no}")
+            say(chosen, sentence(record))
+
+    def watch(loop: Loop) -> None:
+        if loop.execute.trial == 0:
+            for kind in STAGES:
+                loop.bus.subscribe(kind, show)
+
+    return watch

@@ -1,0 +1,1 @@
+"""Experiments: agents on the same seeds, measured and compared."""

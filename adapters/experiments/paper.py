@@ -1,0 +1,46 @@
+"""What arXiv 2601.20714 prints, and what its numbers were found to need. To be held against, never to be copied from."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Printed(NamedTuple):
+    """A number as printed: mean and standard deviation over trials."""
+
+    mean: float
+    sd: float
+
+
+# Table 1. The paper gives the spread of columns 2 and 3 in % of the absolute episode number, 300 + x and 600 + x.
+TABLE1_TOTAL = {
+    "morphin": Printed(23_292.07, 0.0633 * 23_292.07),
+    "q_learning": Printed(40_683.74, 0.0133 * 40_683.74),
+}
+TABLE1_STAGES = {
+    "morphin": (
+        Printed(135.81, 0.0931 * 135.81),
+        Printed(175.17, 0.0580 * (300 + 175.17)),
+        Printed(167.81, 0.0313 * (600 + 167.81)),
+    ),
+    "q_learning": (Printed(256.40, 0.0435 * 256.40), None, None),
+}
+TABLE1_RATIO = 1.747
+
+# Mean return of the last 500 episodes, found over 100-200 trials with the settings of the paper's traffic experiment.
+TRAFFIC_EPISODES = (500, 3000, 3500, 4000, 5000, 8000, 8500, 10000)
+TRAFFIC = {
+    "morphin": (-488, -317, -601, -541, -474, -411, -363, -340),
+    "q_learning": (-486, -320, -708, -700, -688, -678, -361, -336),
+    "same_actions": (-486, -320, -504, -492, -447, -409, -360, -340),
+    "three_actions": (-489, -321, -722, -713, -697, -684, -375, -333),
+}
+
+# Mean steps over episodes 281-300 and 381-400, and share of greedy paths that are optimal; the paper's layout is not
+# published, so these were found on the layout of examples/jump.toml.
+JUMP = {
+    "morphin": (18.3, 5.90, 0.986),
+    "success_rule": (18.3, 7.10, 0.58),
+    "fixed_alpha": (18.2, 15.7, 0.0),
+    "q_learning": (18.2, 17.8, 0.0),
+}

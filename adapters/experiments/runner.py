@@ -1,0 +1,162 @@
+"""Runs the trials of one or several agents into a folder, over worker processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from adapters.results import RunFolder
+from adapters.results.chunk import run_chunk
+from adapters.systems import make_system
+from mape import compose
+from mape.config import Config
+from mape.errors import MapekError
+from mape.loop import Loop
+from mape.trials import TrialResult, chunks, each_completed
+
+CHUNK_SECONDS = 0.8
+PASS_SECONDS, STEP_SECONDS = 20e-6, 10e-6  # rough costs of a pass, and of a step that is not compiled
+
+
+class Stopped(MapekError):
+    """The user stopped the run; what is finished is kept."""
+
+
+def run_agents(
+    configs: Mapping[str, Config],
+    folder: RunFolder,
+    *,
+    workers: int | None = None,
+    trace: tuple[int, int] | None = None,
+    quiet: bool = False,
+    prepare: Callable[[Loop], object] | None = None,
+) -> dict[str, list[TrialResult]]:
+    """Run what is not finished yet, show how far it is, and make each agent's tables.
+
+    Parameters
+    ----------
+    configs
+        Agent -> config.
+    folder
+        Where results are stored as they come.
+    workers
+        Processes; None for one per core. One trial, or one worker, runs in this process.
+    trace
+        Episodes of trial 0 whose steps are kept.
+    prepare
+        Called with each loop before its first pass; then everything runs in this process.
+
+    Returns
+    -------
+    agent -> results in the order of the trials
+
+    Raises
+    ------
+    Stopped
+        After Ctrl-C.
+    MapekError
+        A trial failed, or the disk is full.
+    """
+    finished = {agent: folder.finished(agent) for agent in configs}
+    tasks: list[tuple[Any, ...]] = []
+    for agent, config in configs.items():
+        compiled = _check(config)
+        missing = [trial for trial in range(config.trials) if trial not in finished[agent]]
+        for first, count in chunks(missing, chunk_size(config, compiled)):
+            tasks.append((config.to_json(), first, count, folder.chunk_stem(agent, first, count), trace))
+    total = sum(config.trials * config.episodes for config in configs.values())
+    done = sum(len(finished[agent]) * config.episodes for agent, config in configs.items())
+    workers = min(workers or os.cpu_count() or 1, len(tasks))
+    with tqdm(
+        total=total, initial=done, unit=" episodes", unit_scale=True, disable=True if quiet else None, leave=False,
+        dynamic_ncols=True, smoothing=0.1,
+    ) as bar:  # fmt: skip
+        try:
+            if workers > 1 and prepare is None:
+                _run_in_workers(tasks, workers, bar)
+            else:
+                for task in tasks:
+                    run_chunk(*task, on_rows=lambda rows: bar.update(len(rows)), prepare=prepare)
+        except KeyboardInterrupt:
+            kept = sum(len(folder.finished(agent)) for agent in configs)
+            wanted = sum(config.trials for config in configs.values())
+            raise Stopped(
+                f"stopped. {kept} of {wanted} trials are finished and kept in {folder.path}; "
+                f"the same command with --out {folder.path} continues."
+            ) from None
+    results = {agent: folder.finished(agent) for agent in configs}
+    for agent in configs:
+        folder.assemble(agent)
+    return {agent: [found[trial] for trial in sorted(found)] for agent, found in results.items()}
+
+
+def chunk_size(config: Config, compiled: bool) -> int:
+    """Return how many trials make about a second of work."""
+    cap = config.system.max_steps or 200
+    episode = PASS_SECONDS if compiled else PASS_SECONDS + cap * STEP_SECONDS
+    return max(1, int(CHUNK_SECONDS / (config.episodes * episode)))
+
+
+def _check(config: Config) -> bool:
+    # In this process first: what is wrong with a config is said at once, and the compiled code is in the cache
+    # before several workers want it.
+    system = make_system(config.system)
+    try:
+        return Loop(config, system).execute.compiled
+    finally:
+        system.close()
+
+
+def _run_in_workers(tasks: list[tuple[Any, ...]], workers: int, bar: Any) -> None:
+    # Spawn, never fork: a forked process inherits threads' locks.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
+        try:
+            for results in each_completed(pool, run_chunk, tasks, in_flight=2 * workers):
+                bar.update(sum(result.passes for result in results))
+        except BrokenProcessPool:
+            raise MapekError(
+                "a worker process died (killed, or out of memory?); finished trials are kept, and the same command "
+                "with the same --out continues. Fewer --workers need less memory."
+            ) from None
+
+
+def _start_worker() -> None:
+    # Ctrl-C reaches the whole process group; the parent alone decides, and lets running chunks end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def announce_compilation() -> None:
+    """Say on standard error when something is compiled that is not in the cache."""
+    if not compose.on_compile:
+        compose.on_compile.append(lambda sentence: print(sentence, file=sys.stderr))  # noqa: T201
+
+
+def experiment_config(name: str) -> Path:
+    """Return the path of a ready-made config: of the checkout, or as the installed wheel carries it.
+
+    Raises
+    ------
+    MapekError
+        It is nowhere.
+    """
+    import sysconfig
+
+    here = Path(__file__).resolve().parents[2]
+    for folder in (
+        here / "examples",
+        here / "share" / "mapek" / "examples",
+        Path(sysconfig.get_path("data"), "share", "mapek", "examples"),
+    ):
+        if (folder / f"{name}.toml").exists():
+            return folder / f"{name}.toml"
+    raise MapekError(f"the experiment {name}.toml is not installed; install mapek again")

@@ -1,0 +1,127 @@
+"""The work of one worker: some trials of one agent, with their results on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from adapters.results.files import read_json, whole, write_json
+from adapters.results.table import DTYPE, from_rows
+from adapters.systems import make_system
+from mape.config import from_table
+from mape.errors import ResultsError
+from mape.execute.episode import TRACE_COLUMNS
+from mape.loop import Loop
+from mape.trials import TrialResult, run_trial
+
+TRACE_DTYPE = np.dtype([("episode", "<u4"), *[(name, "<f8") for name in TRACE_COLUMNS]])
+
+
+def run_chunk(
+    config_json: str,
+    first: int,
+    count: int,
+    stem: str,
+    trace: tuple[int, int] | None = None,
+    on_rows: Any = None,
+    prepare: Any = None,
+) -> list[TrialResult]:
+    """Run `count` trials from number `first` and write ``STEM.rows``, ``STEM.npz`` and, last, ``STEM.json``.
+
+    Parameters
+    ----------
+    config_json
+        The config, as `Config.to_json` gives it.
+    stem
+        Path of the results without their endings.
+    trace
+        First and last episode whose steps are kept, of trial 0.
+    on_rows, prepare
+        Further listeners as `run_trial` takes them; only within one process.
+
+    Raises
+    ------
+    MapekError
+        A trial failed, or the results could not be written; nothing of this chunk stays.
+    """
+    config = from_table(json.loads(config_json))
+    results: list[TrialResult] = []
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    digest = hashlib.sha256()
+    path = Path(stem)
+    with whole(path.with_suffix(".rows")) as file:
+        for trial in range(first, first + count):
+
+            def keep(rows: npt.NDArray[np.void], trial: int = trial) -> None:
+                block = from_rows(trial, rows).tobytes()
+                digest.update(block)
+                file.write(block)
+                if on_rows is not None:
+                    on_rows(rows)
+
+            steps: list[npt.NDArray[np.void]] = []
+            kept: list[Loop] = []
+
+            def ready(loop: Loop, trial: int = trial, steps: list[Any] = steps, kept: list[Loop] = kept) -> None:
+                kept.append(loop)
+                if trace is not None and trial == 0:
+                    loop.execute.record_trace(*trace, lambda number, rows: steps.append(_traced(number, rows)))
+                if prepare is not None:
+                    prepare(loop)
+
+            results.append(run_trial(config, trial, make_system, on_rows=keep, prepare=ready))
+            table = kept[0].execute.q_table
+            arrays[f"q_{trial}"] = table.values
+            arrays[f"actions_{trial}"] = np.array(table.actions, dtype=np.int64)
+            if trial == 0 and trace is not None:
+                arrays["trace"] = np.concatenate(steps) if steps else np.empty(0, TRACE_DTYPE)
+    with whole(path.with_suffix(".npz")) as file:
+        np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    write_json(
+        path.with_suffix(".json"),
+        {"rows": count * config.episodes, "rows_sha256": digest.hexdigest(), "trials": [r._asdict() for r in results]},
+    )
+    return results
+
+
+def read_chunk(stem: Path) -> list[TrialResult] | None:
+    """Return the results of a finished chunk, or None where it is not there as a whole.
+
+    Raises
+    ------
+    ResultsError
+        The chunk says that it is finished, but its rows are cut short or changed.
+    """
+    if not stem.with_suffix(".json").exists():
+        return None
+    head = read_json(stem.with_suffix(".json"))
+    rows = stem.with_suffix(".rows")
+    try:
+        if rows.stat().st_size != head["rows"] * DTYPE.itemsize or not stem.with_suffix(".npz").exists():
+            raise ResultsError(
+                f"{rows} is cut short: {rows.stat().st_size} bytes instead of {head['rows'] * DTYPE.itemsize}. "
+                f"Delete {stem}.* to have these trials run again."
+            )
+        return [TrialResult(**{**trial, "alarms": tuple(trial["alarms"])}) for trial in head["trials"]]
+    except (OSError, KeyError, TypeError) as error:
+        raise ResultsError(f"{stem}.* is damaged ({error}); delete it to have these trials run again") from error
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what an interrupted writer left."""
+    for part in folder.rglob("*.part"):
+        os.unlink(part)
+
+
+def _traced(number: int, steps: npt.NDArray[np.float64]) -> npt.NDArray[np.void]:
+    block = np.empty(len(steps), TRACE_DTYPE)
+    block["episode"] = number
+    for i, name in enumerate(TRACE_COLUMNS):
+        block[name] = steps[:, i]
+    return block

@@ -1,0 +1,67 @@
+"""Files that are whole or not there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from mape.errors import ResultsError
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[IO[bytes]]:
+    """Open a file that takes its name only when all of it is written.
+
+    Raises
+    ------
+    ResultsError
+        The disk is full, or the folder cannot be written; nothing of the file stays.
+    """
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with open(part, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise cannot_write(path, error) from error
+        raise
+
+
+def cannot_write(path: Path, error: OSError) -> ResultsError:
+    """Say that a file could not be written, and the way out."""
+    return ResultsError(
+        f"{path} cannot be written: {error.strerror or error}. What was finished before is kept; make room or "
+        "choose another place, and give the same command with the same --out to go on."
+    )
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write data as indented JSON; a number that is not finite is a ValueError."""
+    text = json.dumps(data, indent=2, sort_keys=False, allow_nan=False) + "\n"
+    with whole(path) as file:
+        file.write(text.encode())
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of ours.
+
+    Raises
+    ------
+    ResultsError
+        It cannot be read, or is cut short.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except OSError as error:
+        raise ResultsError(f"{path} cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise ResultsError(f"{path} is damaged ({error}); delete it to have it made again") from error

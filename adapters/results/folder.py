@@ -1,0 +1,207 @@
+"""The folder of a run.
+
+    config-AGENT.json     effective config, which `mapek run` takes as it is
+    manifest.json         what runs, with seeds and versions
+    chunks/               finished trials, as they come; gone when the run is complete
+    episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
+    q_tables-AGENT.npz    Q-tables at the end: q_TRIAL (actions x states), actions_TRIAL (ids of the rows)
+    trace-AGENT.npy       steps of the traced episodes of trial 0
+    result.json           what the command found, with the hashes; its presence says that the run is complete
+    figures/              PNG and PDF
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from adapters.results.chunk import read_chunk, remove_parts
+from adapters.results.files import cannot_write, read_json, whole, write_json
+from adapters.results.table import read_episodes, write_npz
+from mape import __version__
+from mape.config import Config
+from mape.errors import ResultsError
+from mape.trials import TrialResult
+
+FORMAT = 1
+
+
+def versions() -> dict[str, str]:
+    """Return the versions on which the bits of a run depend, and the processor's architecture."""
+    return {
+        "mapek": __version__,
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in ("numpy", "numba", "llvmlite", "gymnasium")},
+        "libc": "-".join(platform.libc_ver()),
+        "architecture": platform.machine(),
+    }
+
+
+def default_path(name: str) -> Path:
+    """Return a folder name that is not taken: results/NAME-DATE-TIME."""
+    stem = Path("results", f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
+    path, n = stem, 1
+    while path.exists():
+        n += 1
+        path = stem.with_name(f"{stem.name}-{n}")
+    return path
+
+
+class RunFolder:
+    """A folder that holds one run, of one or several agents, and nothing else.
+
+    Parameters
+    ----------
+    path
+        A new folder, an empty one, or that of an unfinished run of the same configs, which is then continued.
+    kind
+        The command.
+    configs
+        Agent -> config.
+
+    Raises
+    ------
+    ResultsError
+        The folder holds something else, or another process works in it.
+    """
+
+    def __init__(self, path: Path, kind: str, configs: Mapping[str, Config]) -> None:
+        self.path = path
+        self.configs = dict(configs)
+        self.resumed = 0
+        wanted = {
+            "format": FORMAT,
+            "kind": kind,
+            "agents": {agent: json.loads(config.to_json()) for agent, config in configs.items()},
+            "versions": versions(),
+        }
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(path / ".lock", "a")  # noqa: SIM115 - held until `close`
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._lock.close()
+            raise ResultsError(f"another run is writing to {path}; wait for it, or choose another --out") from None
+        try:
+            self._open(wanted)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, wanted: dict[str, Any]) -> None:
+        manifest = self.path / "manifest.json"
+        if not manifest.exists():
+            if others := [p.name for p in self.path.iterdir() if p.name != ".lock"]:
+                raise ResultsError(
+                    f"{self.path} is not empty ({others[0]}) and holds no run of ours; choose another --out"
+                )
+            write_json(manifest, wanted)
+            for agent in self.configs:
+                write_json(self.path / f"config-{agent}.json", wanted["agents"][agent])
+            return
+        if (self.path / "result.json").exists():
+            raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
+        there = read_json(manifest)
+        if there != wanted:
+            what, had, has = _first_difference(there, wanted)
+            raise ResultsError(
+                f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; give the same command to "
+                "continue it, or choose another --out"
+            )
+        remove_parts(self.path)
+        self.resumed = sum(len(self.finished(agent)) for agent in self.configs)
+
+    def chunk_stem(self, agent: str, first: int, count: int) -> str:
+        """Return where a chunk's results belong."""
+        folder = self.path / "chunks" / agent
+        folder.mkdir(parents=True, exist_ok=True)
+        return str(folder / f"{first:08d}-{first + count - 1:08d}")
+
+    def _stems(self, agent: str) -> list[Path]:
+        return sorted(p.with_suffix("") for p in (self.path / "chunks" / agent).glob("*.json"))
+
+    def finished(self, agent: str) -> dict[int, TrialResult]:
+        """Return the results of the trials that are on disk, by number."""
+        found: dict[int, TrialResult] = {}
+        for stem in self._stems(agent):
+            for result in read_chunk(stem) or ():
+                found[result.trial] = result
+        return found
+
+    def assemble(self, agent: str) -> None:
+        """Make the agent's tables of its chunks."""
+        stems = self._stems(agent)
+        config = self.configs[agent]
+        write_npz(
+            self.path / f"episodes-{agent}.npz",
+            [stem.with_suffix(".rows") for stem in stems],
+            config.trials * config.episodes,
+        )
+        arrays: dict[str, npt.NDArray[Any]] = {}
+        for stem in stems:
+            with np.load(stem.with_suffix(".npz"), allow_pickle=False) as archive:
+                arrays.update({name: archive[name] for name in archive.files})
+        trace = arrays.pop("trace", None)
+        if trace is not None:
+            with whole(self.path / f"trace-{agent}.npy") as file:
+                np.save(file, trace, allow_pickle=False)
+        with whole(self.path / f"q_tables-{agent}.npz") as file:
+            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+
+    def episodes(self, agent: str, *columns: str) -> dict[str, npt.NDArray[Any]]:
+        """Return columns of the agent's table, each of shape (trials, episodes)."""
+        return read_episodes(self.path / f"episodes-{agent}.npz", columns)
+
+    def q_tables(self, agent: str) -> dict[int, tuple[npt.NDArray[np.float64], tuple[int, ...]]]:
+        """Return values and action ids at the end of each trial."""
+        with np.load(self.path / f"q_tables-{agent}.npz", allow_pickle=False) as archive:
+            trials = sorted(int(name[2:]) for name in archive.files if name.startswith("q_"))
+            return {t: (archive[f"q_{t}"], tuple(archive[f"actions_{t}"].tolist())) for t in trials}
+
+    def trace(self, agent: str) -> npt.NDArray[np.void] | None:
+        """Return the traced steps of trial 0, or None where nothing was traced."""
+        path = self.path / f"trace-{agent}.npy"
+        return np.load(path, allow_pickle=False) if path.exists() else None
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Write the result, and remove the chunks that are now in the tables."""
+        write_json(self.path / "result.json", {"command": sys.argv[1:], "versions": versions(), **result})
+        shutil.rmtree(self.path / "chunks", ignore_errors=True)
+
+    def close(self) -> None:
+        """Let others have the folder."""
+        if not self._lock.closed:
+            fcntl.flock(self._lock, fcntl.LOCK_UN)
+            self._lock.close()
+            if not any(p.name != ".lock" for p in self.path.iterdir()):
+                (self.path / ".lock").unlink(missing_ok=True)
+                os.rmdir(self.path)
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def _first_difference(there: Any, wanted: Any, at: str = "") -> tuple[str, Any, Any]:
+    if isinstance(there, dict) and isinstance(wanted, dict):
+        for key in [*there, *wanted]:
+            if there.get(key) != wanted.get(key):
+                return _first_difference(there.get(key), wanted.get(key), f"{at}.{key}" if at else str(key))
+    return at or "manifest", there, wanted
