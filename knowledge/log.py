@@ -78,7 +78,7 @@ class Log:
         self._start: ChangePlan | None = None
         self._open: list[Any] = []  # the records of the pass that is being logged
         self._number = -1  # the pass whose record is expected next; none before plan 0
-        self._expected: type[Record] = Observation
+        self._expected: type[Record] | None = None  # nothing is in order before plan 0
         self._row_size = layout.struct.size
         self._buffer = bytearray(layout.struct.size * SEGMENT)
         self._filled = 0  # bytes of the buffer in use
@@ -178,7 +178,8 @@ class Log:
             raise LookupError(f"pass {number} has left the window; the oldest pass in memory is {oldest}")
         for at in range(number, self.passes + 1):
             yield from self.window[at - oldest][stage if at == number else 0 :]
-        yield from self._open[stage if number > self.passes else 0 :]
+        if number <= self.passes + 1:
+            yield from self._open[stage if number > self.passes else 0 :]
 
     def flush(self) -> None:
         """Hand the rows of all finished passes to the listeners."""

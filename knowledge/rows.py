@@ -95,7 +95,10 @@ class RowLayout:
         """
         readings = symptom.readings
         if self.detectors == 1:  # the common case, without a transposition
-            ((_, value, statistic, alarm, direction),) = readings
+            try:
+                ((_, value, statistic, alarm, direction),) = readings
+            except ValueError:
+                raise self._misfit(seen, f"it has {len(readings)} readings") from None
             numbers: tuple[Any, ...] = (value, _NO_STATISTIC if statistic is None else statistic, alarm)
             directions: tuple[Direction, ...] = (direction,)
         else:
@@ -117,10 +120,13 @@ class RowLayout:
                 buffer, offset, number, in_force, steps, epsilon, next_epsilon, *signals.values(), *numbers, self._last_rare
             )
         except struct.error as error:
-            raise ValueError(
-                f"pass {seen.pass_no} does not fit the run's layout of {len(self.signals)} signals, "
-                f"{self.detectors} detectors and {self.rates} learning-rate parameters: {error}"
-            ) from error
+            raise self._misfit(seen, str(error)) from error
+
+    def _misfit(self, seen: Observation, why: str) -> ValueError:
+        return ValueError(
+            f"pass {seen.pass_no} does not fit the run's layout of {len(self.signals)} signals, "
+            f"{self.detectors} detectors and {self.rates} learning-rate parameters: {why}"
+        )
 
     def pack_start(self, plan: ChangePlan) -> bytes:
         """Pack plan 0, which starts a run, as a pass in which nothing else happened."""

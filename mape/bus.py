@@ -41,9 +41,12 @@ class LocalBus:
         Raises
         ------
         BusError
-            Records before it are missing, or another record has its place.
+            Records before it are missing, another record has its place, or it does not fit the run's layout.
         """
-        ack = self._append(record)
+        try:
+            ack = self._append(record)
+        except ValueError as error:
+            raise BusError(f"{type(record).__name__} {record.pass_no} is refused: {error}") from error
         if ack is _OK:
             self._put(record)
         elif ack is not Ack.DUPLICATE:

@@ -2,7 +2,8 @@
 
 A file may name another one to start from (``extends``), and hold overlays: ``[profiles.NAME]`` and ``[agents.NAME]``
 are tables laid over the rest when that profile or agent is chosen. Overrides (``plan.alpha=0.2``) come last. A table
-that names a part (``name = "..."``) takes the place of one that names another part; else tables are merged.
+that names a part or system (``name = ...``, ``id = ...``) takes the place of one that names another; else tables are
+merged.
 """
 
 from __future__ import annotations
@@ -181,6 +182,8 @@ def load(
         if chosen is not None:
             if chosen not in overlays:
                 raise UnknownName(kind, chosen, overlays, f"They are the [{kind}s.NAME] tables of {path}.")
+            if not isinstance(overlays[chosen], dict):
+                raise ConfigError(f"{path}: {kind}s.{chosen} is a table, [{kind}s.{chosen}]")
             table = merge(table, overlays[chosen])
     for override in overrides:
         table = merge(table, parse_override(override))
@@ -221,18 +224,25 @@ def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
     return merge(below, table)
 
 
-def merge(base: Any, over: Any) -> Any:
-    """Lay one table over another; see the module."""
+def merge(base: Table, over: Table) -> Table:
+    """Lay one table over another; see the module.
+
+    >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": {"k": 6}})
+    {'plan': {'name': 'morphin', 'k': 6}}
+    >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": "q_learning"})
+    {'plan': 'q_learning'}
+    """
+    return base | {key: _lay(base[key], value) if key in base else value for key, value in over.items()}
+
+
+def _lay(base: Any, over: Any) -> Any:
     if isinstance(base, str) and isinstance(over, dict):
         base = {"name": base}
     if not isinstance(base, dict) or not isinstance(over, dict):
         return over
-    if "name" in over and "name" in base and over["name"] != base["name"] and "system" not in base:
-        return dict(over)
-    merged = dict(base)
-    for key, value in over.items():
-        merged[key] = merge(base[key], value) if key in base else value
-    return merged
+    if any(key in base and key in over and base[key] != over[key] for key in ("name", "id")):
+        return over  # another part or system: the options of the one before mean nothing to it
+    return merge(base, over)
 
 
 def parse_override(text: str) -> Table:

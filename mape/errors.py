@@ -33,9 +33,9 @@ class UnknownName(ConfigError):
     def __init__(self, what: str, name: str, legal: Iterable[str], way_out: str = "") -> None:
         legal = sorted(legal)
         close = difflib.get_close_matches(name, legal, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        extra = f" {way_out}" if way_out else ""
-        super().__init__(f"unknown {what} {name!r}{hint} Known: {', '.join(legal)}.{extra}".replace("?  ", "? "))
+        hint = f"; did you mean {close[0]!r}?" if close else "."
+        known = f" Known: {', '.join(legal)}." if legal else ""
+        super().__init__(f"unknown {what} {name!r}{hint}{known}{' ' if way_out else ''}{way_out}")
 
 
 class PartError(MapekError):

@@ -9,6 +9,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, Record, RowLayout, Symptom
 from mape import registry
 from mape.analyze import Analyze
@@ -20,6 +23,8 @@ from mape.execute.component import SIGNALS
 from mape.monitor import Monitor
 from mape.plan import Plan
 from mape.ports import ManagedSystem
+
+Send = Callable[[Any], object]
 
 
 def layout_of(config: Config, system: ManagedSystem) -> RowLayout:
@@ -38,6 +43,40 @@ def layout_of(config: Config, system: ManagedSystem) -> RowLayout:
             )
     learner = registry.build("learner", config.learner)
     return RowLayout(signals, len(config.monitor.detectors), len(learner.rate_names), config.system.max_actions)
+
+
+def build_monitor(config: Config, send: Send) -> Monitor:
+    """Make the Monitor that a config describes."""
+    return Monitor([(spec.signal, registry.build("detector", spec)) for spec in config.monitor.detectors], send)
+
+
+def build_analyze(config: Config, send: Send) -> Analyze:
+    """Make the Analyze that a config describes."""
+    return Analyze(registry.build("analyzer", config.analyze), send)
+
+
+def build_plan(config: Config, knowledge: Knowledge, send: Send) -> Plan:
+    """Make the Plan that a config describes."""
+    schedule = registry.build("schedule", config.plan.schedule)
+    return Plan(registry.build("planner", config.plan, schedule=schedule), knowledge, send)
+
+
+def build_execute(
+    config: Config, system: ManagedSystem, knowledge: Knowledge, send: Send, trial: int = 0, loop: int = 0
+) -> Execute:
+    """Make the Execute that a config describes, over a fresh system."""
+    return Execute(
+        system,
+        registry.build("learner", config.learner),
+        knowledge,
+        send,
+        seed=config.seed,
+        trial=trial,
+        loop=loop,
+        engine=config.execute.engine,
+        mask_greedy=config.execute.mask_greedy,
+        max_actions=config.system.max_actions,
+    )
 
 
 class Loop:
@@ -70,23 +109,10 @@ class Loop:
         self.knowledge = Knowledge(self.log)
         self.bus = LocalBus(self.log)
         send = self.bus.send
-        detectors = [(spec.signal, registry.build("detector", spec)) for spec in config.monitor.detectors]
-        schedule = registry.build("schedule", config.plan.schedule)
-        self.monitor = Monitor(detectors, send)
-        self.analyze = Analyze(registry.build("analyzer", config.analyze), send)
-        self.plan = Plan(registry.build("planner", config.plan, schedule=schedule), self.knowledge, send)
-        self.execute = Execute(
-            system,
-            registry.build("learner", config.learner),
-            self.knowledge,
-            send,
-            seed=config.seed,
-            trial=trial,
-            loop=loop,
-            engine=config.execute.engine,
-            mask_greedy=config.execute.mask_greedy,
-            max_actions=config.system.max_actions,
-        )
+        self.monitor = build_monitor(config, send)
+        self.analyze = build_analyze(config, send)
+        self.plan = build_plan(config, self.knowledge, send)
+        self.execute = build_execute(config, system, self.knowledge, send, trial, loop)
         self.bus.subscribe(Observation, self.monitor.on_observation)
         self.bus.subscribe(Symptom, self.analyze.on_symptom)
         self.bus.subscribe(ChangeRequest, self.plan.on_request)

@@ -43,10 +43,12 @@ from knowledge import (
     to_json,
 )
 from knowledge.records import Direction
+from mape import registry
 from mape.compose import Composed, specialise
+from mape.config import PartSpec
 from mape.errors import PartError
 from mape.execute.component import SIGNALS, Execute
-from mape.execute.rules import Floats, Ints, LearnerConfig, QLearning
+from mape.execute.rules import Floats, Ints
 from mape.ports import Analyzer, Detector, Episode, Learner, ManagedSystem, Planner, Schedule
 
 
@@ -207,9 +209,7 @@ def _travels(record: Record) -> None:
 
 def _stream(*stretches: tuple[float, float, int]) -> tuple[float, ...]:
     rng = random.Random(1954)
-    return tuple(
-        round(rng.gauss(level, spread), 6) for level, spread, count in stretches for _ in range(count)
-    )  # fmt: skip
+    return tuple(round(rng.gauss(level, spread), 6) for level, spread, count in stretches for _ in range(count))
 
 
 STREAM = _stream((50, 5, 150), (-400, 5, 60), (-400, 0, 40), (9000, 200, 240), (-9000, 1, 60))
@@ -275,7 +275,7 @@ PASSES = 60
 
 
 def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
-    """Check an exploration schedule over episodes, drifts and other responses."""
+    """Check an exploration schedule over episodes and responses."""
     returns = _stream((0, 60, PASSES))
 
     def script() -> Feed:
@@ -283,7 +283,7 @@ def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
             readings = [_epsilon(part.epsilon) for part in parts]
             for part in parts:
                 if i % 17 == 11:
-                    part.reset(drift=i % 2 == 0)
+                    part.reset()
                 else:
                     part.advance(returns[i])
             return readings
@@ -295,14 +295,14 @@ def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
         for x in returns:
             first.advance(x)
             second.advance(-abs(x))
-        first.reset(drift=True)
-        second.reset(drift=True)
+        first.reset()
+        second.reset()
         for i, x in enumerate(returns):
             one, other = _epsilon(first.epsilon), _epsilon(second.epsilon)
             if one != other:
                 raise _Broken(
-                    f"two with different returns before a drift explore at {one} and {other}, {i} episodes after it; "
-                    "reset(drift=True) forgets what was counted since the last response"
+                    f"two with different returns before a reset explore at {one} and {other}, {i} episodes after it; "
+                    "reset() forgets what was counted since the last response"
                 )
             first.advance(x)
             second.advance(x)
@@ -313,7 +313,7 @@ def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
         [
             ("keeps epsilon in [0, 1]", _walk(make, script, PASSES)),
             *_resumable(make, script, PASSES),
-            ("starts anew on a drift, whatever the returns before it", explores_anew),
+            ("starts anew on reset, whatever the returns before it", explores_anew),
         ],
     )
 
@@ -391,7 +391,7 @@ class _PlannerScript:
 
     def __init__(self) -> None:
         self.available: tuple[int, ...] = (0, 1, 2)
-        self.known = self.available
+        self.known: tuple[int, ...] = (0, 1, 2)
         self.returns = _stream((0, 60, PASSES))
         self.knowledge: Knowledge | None = None
 
@@ -413,12 +413,10 @@ class _PlannerScript:
         assert before is not None
         reading = Reading("return", signals["return"], None, bool(drifts), "down")
         for record in (
-            Observation(
-                3, i, i - 1, before.epsilon, before.reset_detector, 10, self.available, self.known, signals
-            ),
+            Observation(3, i, i - 1, before.epsilon, before.reset_detector, 10, self.available, self.known, signals),
             Symptom(3, i, signals, self.available, self.known, (reading,)),
             request,
-        ):  # fmt: skip
+        ):
             self.knowledge.log.append(record)
         plans = [self._checked(part.plan(request, self.knowledge), i) for part in parts]
         self._follow(plans[0])
@@ -467,8 +465,8 @@ def _probe(
 ) -> int:
     """Call a learner's rules on many inputs: a template, see `mape.compose`."""
     for i in range(len(states)):
-        values[i] = value(q, rows, 1 + i % len(rows), states[i], epsilon)
-        sizes[i] = step_size(td_errors[i], rates[i])
+        values[i] = value(q, rows, 1 + i % len(rows), states[i], epsilon)  # noqa: F821 (bound by Composed)
+        sizes[i] = step_size(td_errors[i], rates[i])  # noqa: F821
     return len(states)
 
 
@@ -480,7 +478,7 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
         td_errors = np.concatenate([[0.0, 1.0, -1.0, 100.0, -745.0, 1e6], rng.normal(0.0, 30.0, 194)])
         q, rates = rng.normal(0.0, 50.0, (5, 12)), np.sort(rng.random((200, len(learner.rate_names))))
         states = rng.integers(0, 12, 200)
-        return (q, np.array([4, 0, 2, 1]), states, 0.3, td_errors, rates, np.empty(200), np.empty(200))  # fmt: skip
+        return (q, np.array([4, 0, 2, 1]), states, 0.3, td_errors, rates, np.empty(200), np.empty(200))
 
     def bound(learner: Learner) -> Composed:
         return Composed(_probe, {"value": learner.value, "step_size": learner.step_size})
@@ -560,9 +558,14 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
 
     Whether its environment keeps to Gymnasium's own contract is a question for `gymnasium.utils.env_checker`.
     """
+    made: list[Any] = []
+
+    def fresh() -> ManagedSystem:
+        made.append(make())
+        return made[-1]  # type: ignore[no-any-return]
 
     def described() -> None:
-        system = make()
+        system = fresh()
         whole = {"n_states": (system.n_states, 1), "max_steps": (system.max_steps, 1)}
         whole |= {f"draws[{i}]": (draws, 0) for i, draws in enumerate(system.draws)}
         for name, (number, least) in whole.items():
@@ -575,12 +578,12 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
             raise _Broken(f"drifts is {system.drifts!r}; give increasing episodes")
 
     def plays() -> None:
-        system = make()
+        system = fresh()
         for number in range(1, EPISODES + 1):
             _play(system, number)
 
     def foretells() -> None:
-        system = make()
+        system = fresh()
         for number in range(1, EPISODES + 1):
             told = system.available(number)
             _, found = system.begin(_episode(system, number))
@@ -588,12 +591,12 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
                 raise _Broken(f"available({number}) is {told}, and episode {number} offers {found}; or return None")
 
     def deterministic() -> None:
-        first, second = make(), make()
+        first, second = fresh(), fresh()
         for number in range(1, EPISODES + 1):
             _compare(_play(first, number), _play(second, number), f"episode {number} of two fresh ones")
 
     def redriven() -> None:
-        system, other = make(), make()
+        system, other = fresh(), fresh()
         played = {}
         for number in range(1, EPISODES + 1):
             carried = _carried(system)
@@ -615,16 +618,16 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
                 ) from None
 
     def by_rules() -> None:
-        system, other = make(), make()
+        system, other = fresh(), fresh()
         if system.rules is None:
             raise _Noted("offers no rules, so that its episodes are called step by step and not compiled")
         for number in range(1, EPISODES + 1):
             _compare(_play(system, number), _play_by_rules(other, number), f"episode {number}, by step() and by rules")
 
     def compiled() -> None:
-        if make().rules is None:
+        if fresh().rules is None:
             raise _Noted("offers no rules")
-        called, ran = (_learn(make(), engine) for engine in ("python", "compiled"))
+        called, ran = (_learn(fresh(), engine) for engine in ("python", "compiled"))
         for number, (one, other) in enumerate(zip(called, ran, strict=True), 1):
             if one != other:
                 raise _Broken(
@@ -632,9 +635,10 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
                     "of numbers, and floats where integers would overflow"
                 )
 
-    return _judge(
-        make,
-        "name n_states max_steps signal_names drifts draws rules available() begin() step() explorable() enable() close()",
+    findings = _judge(
+        fresh,
+        "name n_states max_steps signal_names drifts draws rules "
+        "available() begin() step() explorable() enable() close()",
         [
             ("describes itself in numbers", described),
             ("stays within its states, with finite rewards and known actions", plays),
@@ -645,6 +649,10 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
             ("learns the same Q-table compiled and called", compiled),
         ],
     )
+    for system in made:
+        if hasattr(system, "close"):
+            system.close()
+    return findings
 
 
 def _episode(system: ManagedSystem, number: int) -> Episode:
@@ -718,9 +726,7 @@ def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
         at = rules.reset_draws + step * rules.step_draws
         state, reward, terminated = rules.step(rules.params, phase, state, action, draws, at, context)
         ended = bool(terminated) or step + 1 == system.max_steps
-        moments.append(
-            _Moment(action, state, float(reward), ended, () if ended else marks(), tuple(context.tolist()))
-        )  # fmt: skip
+        moments.append(_Moment(action, state, float(reward), ended, () if ended else marks(), tuple(context.tolist())))
         if ended:
             break
     return moments
@@ -738,7 +744,7 @@ def _learn(system: ManagedSystem, engine: str) -> list[Any]:
     """Return the observations of a few episodes and, last, the hash of the Q-table."""
     learnt: list[Any] = []
     knowledge = Knowledge(Log(RowLayout(SIGNALS + system.signal_names, 0, 3, 4096)))
-    learner = QLearning(LearnerConfig())
+    learner = registry.build("learner", PartSpec(name="q_learning"))
     execute = Execute(system, learner, knowledge, learnt.append, engine=engine, max_actions=4096)
     execute.adopt(ChangePlan(0, 0, 0.5, (0.1, 0.9, 5.0), (), (), (), False, None))
     for _ in range(EPISODES):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from adapters import detectors
 from adapters.results.files import read_json, whole, write_json
 from adapters.results.table import DTYPE, from_rows
 from adapters.systems import make_system
@@ -50,6 +51,7 @@ def run_chunk(
     MapekError
         A trial failed, or the results could not be written; nothing of this chunk stays.
     """
+    detectors.register()  # a worker process knows no adapters of its own
     config = from_table(json.loads(config_json))
     results: list[TrialResult] = []
     arrays: dict[str, npt.NDArray[Any]] = {}

@@ -17,17 +17,28 @@ from mape.ports import Episode, StepRules
 
 
 def make_system(config: SystemConfig) -> GymnasiumSystem:
-    """Make the environment that a config names.
+    """Make the managed system that a config names.
 
     Raises
     ------
     ConfigError
         There is no such environment, it refuses its options, or it is no table of states and actions.
     """
+    return GymnasiumSystem(make_env(config), config)
+
+
+def make_env(config: SystemConfig) -> gymnasium.Env[Any, Any]:
+    """Make the environment that a config names.
+
+    Raises
+    ------
+    ConfigError
+        There is no such environment, or it refuses its options.
+    """
     register_envs()
     try:
         # Gymnasium's passive checker warns on every reset that an unusual environment makes; `mapek check` does it once.
-        env = gymnasium.make(config.id, disable_env_checker=True, **config.options)
+        return gymnasium.make(config.id, disable_env_checker=True, **config.options)
     except gymnasium.error.NameNotFound:
         raise UnknownName(
             "system", config.id, gymnasium.registry, "Any registered Gymnasium id serves; see `mapek list`."
@@ -38,7 +49,6 @@ def make_system(config: SystemConfig) -> GymnasiumSystem:
         raise ConfigError(f"system {config.id!r} needs the module {error.name!r}, which is not installed") from error
     except Exception as error:
         raise ConfigError(f"system {config.id!r} with options {config.options}: {error}") from error
-    return GymnasiumSystem(env, config)
 
 
 class GymnasiumSystem:

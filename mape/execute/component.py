@@ -92,7 +92,7 @@ class Execute:
         sequence = np.random.SeedSequence(entropy=seed, spawn_key=(loop, trial))
         self._generator = np.random.Generator(np.random.PCG64(sequence))
         self._uniforms = np.empty(self._per_refill * self._width)
-        self._drawn = 0  # number of the pass whose block comes next in a refill
+        self._drawn = -1  # passes before those whose blocks are in `_uniforms`
 
         self._journal = np.empty(cap, dtype=np.int64)
         self._saved = np.empty(cap)
@@ -152,8 +152,9 @@ class Execute:
             raise PartError("no plan is in force; plan 0 starts a run")
         number = self.passes + 1
         turn = self.passes % self._per_refill
-        if turn == 0:
+        if turn == 0 and self._drawn != self.passes:  # an episode that failed is driven again with the same block
             self._generator.random(out=self._uniforms)
+            self._drawn = self.passes
         at = turn * self._width
 
         available = self.system.available(number) if self._rules is not None else None
@@ -330,6 +331,8 @@ class Execute:
         values = self.q_table.values.reshape(-1)
         used = int(self._used[0])
         values[self._journal[:used]] = self._saved[:used]
+        # Driven again, the episode saves these pairs anew.
+        self._touched.reshape(-1)[self._journal[:used]] = 0
 
     def _refused(
         self, status: int, number: int, steps: int, first: float, action: float, td_error: float

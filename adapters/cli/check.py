@@ -1,0 +1,87 @@
+"""`mapek check`: a part or a system against the contract of its port."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from adapters.cli.common import prepare
+from mape import registry, testing
+from mape.config import PartSpec, SystemConfig
+from mape.errors import ConfigError, UnknownName
+from mape.testing import Finding
+
+# The members by which a class of one's own is told; the first kind that has them all.
+_MEMBERS = {
+    "detector": ("update", "reset"),
+    "analyzer": ("analyze",),
+    "planner": ("plan", "start"),
+    "schedule": ("advance", "reset"),
+    "learner": ("value", "step_size"),
+}
+_CHECKS: dict[str, Callable[[Callable[[], Any]], list[Finding]]] = {
+    "detector": testing.check_detector,
+    "analyzer": testing.check_analyzer,
+    "planner": testing.check_planner,
+    "schedule": testing.check_schedule,
+    "learner": testing.check_learner,
+    "system": testing.check_system,
+}
+
+
+def execute(chosen: argparse.Namespace) -> int:
+    """Run the command; exit code 1 where a clause is broken."""
+    prepare()
+    kind = chosen.kind or _kind_of(chosen.name)
+    findings = _system(chosen.name) if kind == "system" else _CHECKS[kind](_maker(kind, chosen.name))
+    print(f"{kind} {chosen.name}")
+    for finding in findings:
+        print(f"  {finding}")
+    broken = sum(finding.verdict == "failed" for finding in findings)
+    print(f"{len(findings)} checks, {broken} failed" if broken else f"{len(findings)} checks, all kept")
+    return 1 if broken else 0
+
+
+def _kind_of(name: str) -> str:
+    kinds = [kind for kind, parts in registry.PARTS.items() if name in parts]
+    if len(kinds) > 1:
+        raise ConfigError(f"{name!r} is a {' and a '.join(kinds)}; say which with --kind")
+    if kinds:
+        return kinds[0]
+    module, _, attribute = name.partition(":")
+    if not attribute or "/" in name:
+        from adapters.systems.checking import is_registered
+
+        if is_registered(name):
+            return "system"
+        known = {part for parts in registry.PARTS.values() for part in parts}
+        raise UnknownName("part or system", name, known, 'A part of your own is "module:Class", a system a Gymnasium id.')
+    part = registry.find("detector", name)
+    if inspect.isclass(part):
+        for kind, members in _MEMBERS.items():
+            if all(hasattr(part, member) for member in members):
+                return kind
+    raise ConfigError(
+        f"{name!r} has the members of no part: "
+        + "; ".join(f"a {kind} has {', '.join(members)}" for kind, members in _MEMBERS.items())
+        + ". Name the kind with --kind to see what is missing."
+    )
+
+
+def _maker(kind: str, name: str) -> Callable[[], Any]:
+    def make() -> Any:
+        schedule = registry.build("schedule", PartSpec(name="exponential"))
+        return registry.build(kind, PartSpec(name=name), **({"schedule": schedule} if kind == "planner" else {}))
+
+    make()  # what is wrong with the options is the user's to know, not a broken contract
+    return make
+
+
+def _system(name: str) -> list[Finding]:
+    from adapters.systems import make_system
+    from adapters.systems.checking import check_environment, default_view
+
+    config: SystemConfig = default_view(name)
+    return [check_environment(config), *testing.check_system(lambda: make_system(config))]

@@ -1,0 +1,21 @@
+"""Other people's drift detectors, under the loop's detector port."""
+
+from mape import registry
+
+__all__ = ["register"]
+
+
+def register() -> None:
+    """Give these detectors their short names; a second call changes nothing.
+
+    >>> register()
+    >>> registry.PARTS["detector"]["adwin"].summary
+    "River's ADWIN: adaptive window, both sides; needs mapek[river]"
+    """
+    home = "adapters.detectors.river_detector"
+    registry.register(
+        "detector", "river", f"{home}:RiverDetector", "any drift detector of River by name; needs mapek[river]"
+    )
+    registry.register(
+        "detector", "adwin", f"{home}:Adwin", "River's ADWIN: adaptive window, both sides; needs mapek[river]"
+    )
