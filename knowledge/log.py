@@ -113,7 +113,9 @@ class Log:
         if signals is not seen[8] and signals != seen[8]:
             return Ack.CONFLICT
         if kind is Symptom:
-            if (record[3] is not seen[6] and record[3] != seen[6]) or (record[4] is not seen[7] and record[4] != seen[7]):
+            if (record[3] is not seen[6] and record[3] != seen[6]) or (
+                record[4] is not seen[7] and record[4] != seen[7]
+            ):
                 return Ack.CONFLICT
             self._expected = ChangeRequest
         else:

@@ -123,7 +123,7 @@ class MalformedRecord(ValueError):
 
 
 @functools.cache
-def _adapter(kind: type[Record]) -> TypeAdapter[Any]:
+def _adapter(kind: Any) -> TypeAdapter[Any]:
     # pydantic costs a tenth of a second to import and is needed only where records leave the process.
     from pydantic import ConfigDict, TypeAdapter
 

@@ -84,7 +84,13 @@ class RowLayout:
         return json.dumps(head, sort_keys=True, separators=(",", ":")).encode()
 
     def pack_into(
-        self, buffer: bytearray, offset: int, seen: Observation, symptom: Symptom, request: ChangeRequest, plan: ChangePlan
+        self,
+        buffer: bytearray,
+        offset: int,
+        seen: Observation,
+        symptom: Symptom,
+        request: ChangeRequest,
+        plan: ChangePlan,
     ) -> None:
         """Write one pass at `offset`.
 
@@ -117,7 +123,16 @@ class RowLayout:
                 self._last_rare = self._pack_rare(*key)
                 self._last_key = key
             self.struct.pack_into(
-                buffer, offset, number, in_force, steps, epsilon, next_epsilon, *signals.values(), *numbers, self._last_rare
+                buffer,
+                offset,
+                number,
+                in_force,
+                steps,
+                epsilon,
+                next_epsilon,
+                *signals.values(),
+                *numbers,
+                self._last_rare,
             )
         except struct.error as error:
             raise self._misfit(seen, str(error)) from error
@@ -171,7 +186,7 @@ class RowLayout:
             next_reset,
             *masks,
             *rate,
-            b"" if adopt is None else bytes.fromhex(adopt),
+            b"" if adopt is None else _hash_bytes(adopt),
         )
 
     def _drift_codes(self, drifts: tuple[Drift, ...]) -> list[int]:
@@ -183,6 +198,16 @@ class RowLayout:
                 raise ValueError(f"two drifts of signal {signal!r} in one request; say it once")
             codes[signal] = DIRECTIONS[direction]
         return list(codes.values())
+
+
+def _hash_bytes(text: str) -> bytes:
+    try:
+        digest = bytes.fromhex(text)
+    except ValueError:
+        digest = b""
+    if len(digest) != 32:
+        raise ValueError(f"{text!r} is no SHA-256: that has 64 hexadecimal digits")
+    return digest
 
 
 _NUMPY_CODES = {"q": "<i8", "d": "<f8", "?": "?", "Q": "<u8", "B": "u1", "32s": "V32"}

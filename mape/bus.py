@@ -9,7 +9,6 @@ from typing import Any
 from knowledge import STAGES, Ack, Log, Record
 from mape.errors import BusError
 
-
 _OK = Ack.OK
 
 
@@ -28,7 +27,7 @@ class LocalBus:
         self._log = log
         self._handlers: dict[type, list[Callable[[Any], object]]] = {kind: [] for kind in STAGES}
         self._waiting: deque[Record] = deque()
-        self._append = log.append
+        self._append: Callable[[Record], Ack] = log.append
         self._put = self._waiting.append
 
     def subscribe(self, kind: type[Record], handler: Callable[[Any], object]) -> None:
@@ -50,11 +49,7 @@ class LocalBus:
         if ack is _OK:
             self._put(record)
         elif ack is not Ack.DUPLICATE:
-            raise BusError(
-                f"{type(record).__name__} {record.pass_no} is refused as a {ack.value}: the log holds "
-                f"{self._log.passes} finished passes. Each stage sends one record per pass, in order, and hands on "
-                "the signals and action sets that it was given."
-            )
+            raise refusal(record, ack, self._log.passes)
 
     def deliver(self) -> Record | None:
         """Deliver the oldest waiting record and return it, or return None where none waits."""
@@ -76,6 +71,22 @@ class LocalBus:
             delivered += 1
         return delivered
 
+    def connect(self) -> None:
+        """Do nothing: within a process all is connected."""
+
     def close(self) -> None:
-        """Drop what still waits; the log keeps it."""
+        """Drop what still waits, and take nothing more; the log keeps what it has."""
         self._waiting.clear()
+        self._append = _closed
+
+
+def refusal(record: Record, ack: Ack, passes: int) -> BusError:
+    """Say why the log, which holds `passes` finished passes, did not take a record."""
+    return BusError(
+        f"{type(record).__name__} {record.pass_no} is refused as a {ack.value}: the log holds {passes} finished passes. "
+        "Each stage sends one record per pass, in order, and hands on the signals and action sets that it was given."
+    )
+
+
+def _closed(record: Record) -> Ack:
+    raise BusError(f"{type(record).__name__} {record.pass_no} was sent on a closed bus")

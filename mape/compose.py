@@ -162,7 +162,8 @@ def _load(text: str, key: str, name: str, rules: tuple[Rule, ...]) -> Any:
             file.write(text)
         os.replace(file.name, path)
     spec = importlib.util.spec_from_file_location(f"_mapek_{key}", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
@@ -182,7 +183,7 @@ def specialise(dispatcher: Any, arguments: tuple[Any, ...]) -> Rule:
     """
     import numba
 
-    signature = tuple(numba.typeof(argument) for argument in arguments)
+    signature = tuple(numba.typeof(argument) for argument in arguments)  # type: ignore[no-untyped-call]
     if signature not in dispatcher.overloads:
         folder = Path(dispatcher.py_func.__code__.co_filename).parent
         if not any(folder.glob("__pycache__/*.nbc")):
@@ -192,7 +193,7 @@ def specialise(dispatcher: Any, arguments: tuple[Any, ...]) -> Rule:
             dispatcher.compile(signature)
         except numba.core.errors.NumbaError as error:
             raise ConfigError(
-                f"a rule cannot be compiled by Numba: {str(error).strip().splitlines()[-1]} Choose the engine 'python' to run it as it is, "
-                "or keep to what Numba compiles."
+                f"a rule cannot be compiled by Numba: {str(error).strip().splitlines()[-1]} Choose the engine "
+                "'python' to run it as it is, or keep to what Numba compiles."
             ) from error
     return dispatcher.overloads[signature].entry_point  # type: ignore[no-any-return]

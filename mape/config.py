@@ -85,7 +85,9 @@ class SystemConfig(PartConfig):
 
     id: str = Field(min_length=1)
     options: dict[str, Any] = {}
-    max_steps: int | None = Field(None, ge=1, le=1_000_000, description="longest episode; needed where the system has no cap")
+    max_steps: int | None = Field(
+        None, ge=1, le=1_000_000, description="longest episode; needed where the system has no cap"
+    )
     max_actions: int = Field(64, ge=1, le=4096, description="largest number of actions that the records can hold")
     discretise: BoxGrid | None = None
 
@@ -142,7 +144,7 @@ def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
 
     try:
         # From JSON text, where a list may stand for a tuple even in strict mode.
-        config = Config.model_validate_json(json.dumps(table, default=_refuse))
+        config = Config.model_validate_json(json.dumps(table, default=lambda value: _refuse(value, where)))
     except ValidationError as error:
         raise ConfigError(_explain(error, where)) from None
     for kind, path, spec in parts_of(config):
@@ -265,8 +267,8 @@ def parse_override(text: str) -> Table:
     return table
 
 
-def _refuse(value: Any) -> Any:
-    raise ConfigError(f"{value!r} is not a number, text, true or false, or a list or table of such")
+def _refuse(value: Any, where: str) -> Any:
+    raise ConfigError(f"{where}: {value!r} is not a number, text, true or false, or a list or table of such")
 
 
 def _explain(error: ValidationError, where: str) -> str:
@@ -284,8 +286,8 @@ def _explain(error: ValidationError, where: str) -> str:
             message = f"no such option{hint}"
         elif problem["type"] == "missing":
             message = "is needed and missing"
-        elif not isinstance(given, dict):
-            message = f"{message[:1].lower()}{message[1:]}, got {given!r}"
+        elif problem["type"] != "value_error":
+            message = f"{message[:1].lower()}{message[1:]}, got {'a table' if isinstance(given, dict) else repr(given)}"
         lines.append(f"{where}: {loc}: {message}" if loc else f"{where}: {message}")
     return "\n".join(lines)
 

@@ -1,10 +1,10 @@
 """The loop: one pass, written once.
 
-                 Knowledge (log, plan in force, known actions, Q by request)
-                    |           |             |           |
-    Observation -> Monitor -> Symptom -> Analyze -> ChangeRequest -> Plan -> ChangePlan -> Execute
-         ^                                                                                   |
-         +--------------------------- managed system <---------------------------------------+
+             Knowledge (log, plan in force, known actions, Q by request)
+                |           |             |           |
+Observation -> Monitor -> Symptom -> Analyze -> ChangeRequest -> Plan -> ChangePlan -> Execute
+     ^                                                                                   |
+     +--------------------------- managed system <---------------------------------------+
 """
 
 from __future__ import annotations
@@ -145,4 +145,3 @@ class Loop:
         for _ in range(passes):
             drive()
             settle()
-

@@ -146,12 +146,15 @@ class Bus(Protocol):
     """Takes records to Knowledge, which appends them, and hands what was appended to the subscribers.
 
     Records arrive in the order of the log, each once; a handler runs to completion before the next record is
-    delivered, and may send. What a handler raises comes out of `run`.
+    delivered, and may send. What a handler raises comes out of `run`, which delivers all that the log held at the call
+    and all that is sent meanwhile through this bus, and returns their number. After `close` nothing is sent or
+    delivered.
     """
 
     def subscribe(self, kind: type[Record], handler: Callable[[Any], object]) -> None: ...
     def send(self, record: Record) -> None: ...
-    def run(self) -> int: ...  # deliver until nothing waits; the number delivered
+    def connect(self) -> None: ...
+    def run(self) -> int: ...
     def close(self) -> None: ...
 
 

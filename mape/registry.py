@@ -47,6 +47,15 @@ PARTS: dict[str, dict[str, Entry]] = {
     },
 }
 
+MEMBERS: dict[str, tuple[str, ...]] = {
+    "detector": ("direction", "statistic", "update", "reset"),
+    "analyzer": ("analyze",),
+    "planner": ("start", "plan"),
+    "schedule": ("epsilon", "advance", "reset"),
+    "learner": ("rate_names", "discount", "bootstrap_terminal", "value", "step_size"),
+}
+"""What the loop calls of a part; without it there is no run. `mapek check` asks for more."""
+
 
 def register(kind: str, name: str, target: str, summary: str) -> None:
     """Give a part a short name; for adapters, at import."""
@@ -69,6 +78,8 @@ def find(kind: str, name: str) -> Any:
     else:
         raise UnknownName(kind, name, entries, 'A part of your own is named "module:Class".')
     module_name, _, attribute = target.partition(":")
+    if not module_name or not attribute:
+        raise ConfigError(f'{kind} {name!r} is not of the form "module:Class", such as "my_parts:MyDetector"')
     if os.getcwd() not in sys.path:
         # The console script does not look where the user stands; `python -m` does.
         sys.path.append(os.getcwd())
@@ -118,12 +129,17 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
     part, options = options_of(kind, spec, kind)
     try:
         if isinstance(options, BaseModel):
-            return part(options, **extra)
-        taken = {name: value for name, value in extra.items() if name in inspect.signature(part).parameters}
-        return part(**options, **taken)
+            made = part(options, **extra)
+        else:
+            taken = {name: value for name, value in extra.items() if name in inspect.signature(part).parameters}
+            made = part(**options, **taken)
+        missing = [member for member in MEMBERS.get(kind, ()) if not hasattr(made, member)]
     except ConfigError:
         raise
     except Exception as error:
         raise ConfigError(
             f"{kind} {spec.name!r} cannot be made with {options or 'no options'}: {type(error).__name__}: {error}"
         ) from error
+    if missing:
+        raise ConfigError(f"{kind} {spec.name!r} has no {', '.join(missing)}; see {kind.capitalize()} in mape.ports")
+    return made

@@ -456,8 +456,9 @@ class _PlannerScript:
         self.knowledge.actions = self.known
 
 
-value: Any
-step_size: Any
+# Bound by `mape.compose`.
+value: Any = None
+step_size: Any = None
 
 
 def _probe(
@@ -465,8 +466,8 @@ def _probe(
 ) -> int:
     """Call a learner's rules on many inputs: a template, see `mape.compose`."""
     for i in range(len(states)):
-        values[i] = value(q, rows, 1 + i % len(rows), states[i], epsilon)  # noqa: F821 (bound by Composed)
-        sizes[i] = step_size(td_errors[i], rates[i])  # noqa: F821
+        values[i] = value(q, rows, 1 + i % len(rows), states[i], epsilon)
+        sizes[i] = step_size(td_errors[i], rates[i])
     return len(states)
 
 

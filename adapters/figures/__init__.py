@@ -1,0 +1,19 @@
+"""Figures, drawn with matplotlib from plain arrays: arrays in, figure out, and `save` writes it."""
+
+from adapters.figures.comparison import Compared, comparison
+from adapters.figures.convergence import convergence
+from adapters.figures.internal_dynamics import internal_dynamics
+from adapters.figures.learning_curve import learning_curve
+from adapters.figures.q_heatmaps import Panel, q_heatmaps
+from adapters.figures.style import save
+
+__all__ = [
+    "Compared",
+    "Panel",
+    "comparison",
+    "convergence",
+    "internal_dynamics",
+    "learning_curve",
+    "q_heatmaps",
+    "save",
+]

@@ -1,7 +1,7 @@
 """The built-in analysis: every alarm is a drift of its signal, and action sets are compared.
 
-    added   = available - known        (in the order in which the system names them)
-    removed = known - available
+added   = available - known        (in the order in which the system names them)
+removed = known - available
 """
 
 from __future__ import annotations
@@ -30,11 +30,13 @@ class Changes:
         """Say what changed."""
         loop, number, signals, available, known, readings = symptom
         drifts: tuple[Drift, ...] = ()
+        added: tuple[int, ...]
+        removed: tuple[int, ...]
         for signal, _, _, alarm, direction in readings:
             if alarm and all(signal != drift.signal for drift in drifts):
                 drifts += (Drift(signal, direction),)
         if available == known:
-            added = removed = ()
+            added, removed = (), ()
         else:
             added = tuple(a for a in available if a not in known)
             removed = tuple(a for a in known if a not in available)

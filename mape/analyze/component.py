@@ -30,7 +30,7 @@ class Analyze:
         Raises
         ------
         PartError
-            The analyzer raised.
+            The analyzer raised, or gave no change request.
         """
         try:
             request = self.analyzer.analyze(symptom)
@@ -39,4 +39,9 @@ class Analyze:
                 f"analyzer {type(self.analyzer).__name__} raised {type(error).__name__}: {error}, at pass "
                 f"{symptom.pass_no}"
             ) from error
+        if type(request) is not ChangeRequest:
+            raise PartError(
+                f"analyzer {type(self.analyzer).__name__} returned {request!r} at pass {symptom.pass_no}; an analyzer "
+                "returns a ChangeRequest"
+            )
         self._send(request)

@@ -134,6 +134,10 @@ class Execute:
                     f"{len(self.learner.rate_names)}: {', '.join(self.learner.rate_names)}"
                 )
             self._rate = rate_array(plan.learning_rate)
+            if not np.isfinite(self._rate).all():
+                raise PartError(
+                    f"plan {plan.pass_no} has the learning rate {plan.learning_rate}; it is of finite numbers"
+                )
             self._fix_arguments()
         self.plan = plan
 
@@ -269,6 +273,10 @@ class Execute:
             raise ManagedSystemError(
                 f"{self.system.name} offers no action in episode {number}; a managed system has at least one available"
             )
+        if len(set(available)) != len(available):
+            raise ManagedSystemError(
+                f"{self.system.name} offers actions {available} in episode {number}; name each action once"
+            )
         for action in available:
             if not 0 <= action < self._max_actions:
                 raise ManagedSystemError(
@@ -342,6 +350,11 @@ class Execute:
         if status == episode.OFF_TABLE:
             return ManagedSystemError(
                 f"{self.system.name} went to state {int(first)} {where}; its states are 0 .. {self.system.n_states - 1}. {kept}"
+            )
+        if status == episode.OVERFLOW:
+            return NonFiniteError(
+                f"the return of episode {number} became {first}, its mean absolute TD error {action}, its largest change "
+                f"of Q {td_error}: too large for a float. {kept} Scale the rewards down."
             )
         if isfinite(first):
             return NonFiniteError(

@@ -6,9 +6,10 @@ from typing import Any
 
 from mape.execute.rules import Floats
 
-phase_rule: Any
-reset_rule: Any
-step_rule: Any
+# Bound by `mape.compose`.
+phase_rule: Any = None
+reset_rule: Any = None
+step_rule: Any = None
 
 
 def begin_by_rules(params: Any, number: int, draws: Floats, at: int) -> tuple[int, int]:

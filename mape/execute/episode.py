@@ -12,13 +12,14 @@ from typing import Any
 
 from mape.execute.rules import Floats, Ints, greedy
 
-begin: Any
-act: Any
-explorable: Any
-value: Any
-step_size: Any
+# Bound by `mape.compose`.
+begin: Any = None
+act: Any = None
+explorable: Any = None
+value: Any = None
+step_size: Any = None
 
-OK, NON_FINITE, OFF_TABLE = 0, 1, 2
+OK, NON_FINITE, OFF_TABLE, OVERFLOW = 0, 1, 2, 3
 TRACE_COLUMNS = ("state", "action", "exploratory", "q", "td_error", "alpha")
 
 
@@ -76,7 +77,8 @@ def episode(
     Returns
     -------
     status, steps, return, mean absolute TD error, max absolute change of Q
-        On a status other than OK the last three are the state or reward, action and TD error at fault.
+        On a status other than OK the last three are the state or reward, action and TD error at fault; OVERFLOW leaves
+        them as they are, one of them not finite.
     """
     used[0] = 0
     used[1] = 0
@@ -166,4 +168,6 @@ def episode(
             change = difference
     for k in range(len(context)):
         context[k] /= steps
+    if not (math.isfinite(total) and math.isfinite(total_td) and math.isfinite(change)):
+        return OVERFLOW, steps, total, total_td / steps, change
     return OK, steps, total, total_td / steps, change

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from mape.config import PartConfig
-from pydantic import Field
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -20,7 +20,7 @@ Ints = npt.NDArray[np.int64]
 
 def greedy(q: Floats, rows: Ints, count: int, state: int) -> int:
     """Return the row of the largest value of `state`; of equal ones, the first."""
-    best = rows[0]
+    best: int = rows[0]
     for i in range(1, count):
         if q[rows[i], state] > q[best, state]:
             best = rows[i]
@@ -29,7 +29,8 @@ def greedy(q: Floats, rows: Ints, count: int, state: int) -> int:
 
 def max_value(q: Floats, rows: Ints, count: int, state: int, epsilon: float) -> float:
     """Return the largest value of `state`: what Q-learning bootstraps from (Watkins 1989)."""
-    return q[greedy(q, rows, count, state), state]
+    best: float = q[greedy(q, rows, count, state), state]
+    return best
 
 
 def expected_value(q: Floats, rows: Ints, count: int, state: int, epsilon: float) -> float:
@@ -48,7 +49,8 @@ def alpha_star(td_error: float, rate: Floats) -> float:
     >>> round(alpha_star(-1.0, (0.1, 0.99, 5.0)), 12)
     0.116007726866
     """
-    return rate[0] + (rate[1] - rate[0]) / (1.0 + math.exp(-(abs(td_error) - rate[2])))
+    alpha: float = rate[0] + (rate[1] - rate[0]) / (1.0 + math.exp(-(abs(td_error) - rate[2])))
+    return alpha
 
 
 class LearnerConfig(PartConfig):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import isfinite
 
 from knowledge import Observation, Reading, Symptom
+from knowledge.rows import DIRECTIONS
 from mape.errors import PartError
 from mape.ports import Detector
 
@@ -27,6 +29,12 @@ class Monitor:
 
     def __init__(self, detectors: Sequence[tuple[str, Detector]], send: Callable[[Symptom], object]) -> None:
         self.detectors = tuple(detectors)
+        for name, detector in self.detectors:
+            if (direction := getattr(detector, "direction", None)) not in DIRECTIONS:
+                raise PartError(
+                    f"detector {type(detector).__name__} on {name} watches the side {direction!r}; its direction is one "
+                    f"of {', '.join(DIRECTIONS)}"
+                )
         self._send = send
 
     def on_observation(self, seen: Observation) -> None:
@@ -44,8 +52,10 @@ class Monitor:
                 if reset:
                     detector.reset()
                 value = signals[name]
-                alarm = detector.update(value)
-                reading = _new(Reading, (name, value, detector.statistic, alarm, detector.direction))
+                alarm, statistic = detector.update(value), detector.statistic
+                if statistic is not None and not isfinite(statistic):
+                    raise ValueError(f"its statistic is {statistic!r}, not a finite number or None")
+                reading = _new(Reading, (name, value, statistic, alarm, detector.direction))
                 if alarm:
                     detector.reset()
             except Exception as error:

@@ -56,7 +56,7 @@ class PageHinkley:
         self.config = config
         self._delta = config.delta
         self._threshold = config.threshold
-        self.reset()
+        self._n = self._mean = self._total = self._minimum = 0.0
 
     @property
     def statistic(self) -> float:

@@ -1,4 +1,4 @@
-"""Two-window test of the mean: are the newest values far from the ones before them?
+"""Two-window test of the mean: whether the newest values are far from the ones before them.
 
     z = (mean(recent) - mean(reference)) / sqrt(var(reference) / reference_size + var(recent) / recent_size)
     alarm iff |z| > threshold
@@ -54,6 +54,7 @@ class TwoWindow:
 
     def __init__(self, config: TwoWindowConfig) -> None:
         self.config = config
+        self._z: float | None = None
         self.reset()
 
     @property
@@ -75,15 +76,13 @@ class TwoWindow:
         # Sums are taken relative to one value of the window: squares of large offsets would cancel.
         old = [v - values[0] for v in values[: self.config.reference]]
         new = [v - values[0] for v in values[self.config.reference :]]
-        self._z = two_window_z(
-            len(old), sum(old), sum(v * v for v in old), len(new), sum(new), sum(v * v for v in new)
-        )
+        self._z = two_window_z(len(old), sum(old), sum(v * v for v in old), len(new), sum(new), sum(v * v for v in new))
         return abs(self._z) > self.config.threshold
 
     def reset(self) -> None:
         """Forget everything."""
         self._values: deque[float] = deque(maxlen=self.config.reference + self.config.recent)
-        self._z: float | None = None
+        self._z = None
 
     def state(self) -> dict[str, Any]:
         """Return the values in the windows and the last z."""

@@ -33,7 +33,7 @@ class Plan:
             plan = self.planner.start(loop)
         except Exception as error:
             raise self._failed(0, error) from error
-        self._put(plan)
+        self._put(plan, 0)
         return plan
 
     def on_request(self, request: ChangeRequest) -> None:
@@ -42,18 +42,23 @@ class Plan:
         Raises
         ------
         PartError
-            The planner raised, or its exploration rate is outside [0, 1].
+            The planner raised, gave no plan, or an exploration rate outside [0, 1].
         """
         try:
             plan = self.planner.plan(request, self._knowledge)
         except Exception as error:
             raise self._failed(request.pass_no, error) from error
-        self._put(plan)
+        self._put(plan, request.pass_no)
 
-    def _put(self, plan: ChangePlan) -> None:
-        if not 0.0 <= plan.epsilon <= 1.0:
+    def _put(self, plan: ChangePlan, number: int) -> None:
+        if type(plan) is not ChangePlan:
             raise PartError(
-                f"planner {type(self.planner).__name__} gave epsilon {plan.epsilon!r} for pass {plan.pass_no}; an "
+                f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a ChangePlan"
+            )
+        epsilon = plan.epsilon
+        if not (isinstance(epsilon, float | int) and 0.0 <= epsilon <= 1.0):
+            raise PartError(
+                f"planner {type(self.planner).__name__} gave epsilon {epsilon!r} for pass {number}; an "
                 "exploration rate is a number in [0, 1]"
             )
         self._knowledge.plan = plan

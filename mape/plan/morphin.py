@@ -26,7 +26,9 @@ class MorphinConfig(PartConfig):
 
     alpha: float = Field(0.1, gt=0, le=1, description="learning rate at a TD error far below k")
     alpha_max: float = Field(0.99, gt=0, le=1, description="learning rate at a TD error far above k")
-    k: float = Field(5.0, ge=0, le=700, description="absolute TD error at which the rate is half-way, in units of reward")
+    k: float = Field(
+        5.0, ge=0, le=700, description="absolute TD error at which the rate is half-way, in units of reward"
+    )
     respond_to: tuple[Literal["drift", "added", "removed"], ...] = ("drift", "added")
     enable_on_drift: tuple[int, ...] = ()
 
@@ -83,9 +85,7 @@ class Morphin:
                 self.schedule.advance(signals["return"])
         else:
             self.schedule.advance(signals["return"])
-        return _new(
-            ChangePlan, (loop, number, self.schedule.epsilon, self._rate, add, drop, enable, reset, None)
-        )
+        return _new(ChangePlan, (loop, number, self.schedule.epsilon, self._rate, add, drop, enable, reset, None))
 
     def state(self) -> Any:
         """Return the schedule's state and the actions that are still to be enabled."""

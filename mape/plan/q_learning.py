@@ -39,9 +39,7 @@ class QLearningPlanner:
         """Return the plan of the next episode."""
         loop, number, _, add, drop, signals = request
         self.schedule.advance(signals["return"])
-        return tuple.__new__(
-            ChangePlan, (loop, number, self.schedule.epsilon, self._rate, add, drop, (), False, None)
-        )
+        return tuple.__new__(ChangePlan, (loop, number, self.schedule.epsilon, self._rate, add, drop, (), False, None))
 
     def state(self) -> Any:
         """Return the schedule's state."""

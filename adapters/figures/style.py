@@ -1,0 +1,231 @@
+"""One look for all figures, and the way they get to the disk.
+
+Nothing here goes through `matplotlib.pyplot`: a figure belongs to whoever asked for it, so figures can be drawn in
+several threads. Text is plain Unicode, not mathtext, whose parser is shared between threads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import secrets
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import numpy.typing as npt
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+
+COLUMN, PAGE = 3.5, 7.2
+"""Width of a column and of a page, in inches."""
+
+SMALL, NORMAL = 8.0, 9.0
+"""Sizes of text in points: ticks and legends, labels and titles."""
+
+FAMILY = "DejaVu Sans"  # comes with matplotlib, so a figure has the same bytes on every machine
+INK, MUTED, GRID, BAND = "#222222", "#666666", "#e4e4e4", "#c4c4c4"
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's palette, which readers with any colour vision tell apart; without yellow, too pale for a line."""
+
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1.5, 1, 1.5)))
+"""Line styles, so that neighbours differ in greyscale too."""
+
+PNG_DPI, RASTER_DPI = 200, 400
+
+_saving = threading.Lock()
+
+
+def colour(index: int) -> str:
+    """Return the colour of the agent at `index` of its figure."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def dashes(index: int) -> Any:
+    """Return the line style of the agent at `index` of its figure."""
+    return DASHES[index % len(DASHES)]
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure with an Agg canvas; sizes in inches."""
+    figure = Figure(figsize=(width, height), dpi=PNG_DPI, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def dress(axes: Axes, *, xlabel: str = "", ylabel: str = "", grid: str = "y") -> None:
+    """Give axes the shared look: two thin spines, a light grid behind the data along `grid` (x, y, both or none)."""
+    axes.set_facecolor("white")
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_linewidth(0.6)
+        spine.set_edgecolor(MUTED)
+    axes.tick_params(
+        labelsize=SMALL, labelfontfamily=FAMILY, width=0.6, length=2.5, color=MUTED, labelcolor=INK, direction="out"
+    )
+    axes.set_axisbelow(True)
+    axes.grid(False)
+    if grid in ("x", "both"):
+        axes.xaxis.grid(True, color=GRID, linewidth=0.5, linestyle="-")
+    if grid in ("y", "both"):
+        axes.yaxis.grid(True, color=GRID, linewidth=0.5, linestyle="-")
+    if xlabel:
+        axes.set_xlabel(xlabel, fontsize=NORMAL, family=FAMILY, color=INK, parse_math=False)
+    if ylabel:
+        axes.set_ylabel(ylabel, fontsize=NORMAL, family=FAMILY, color=INK, parse_math=False)
+
+
+def headline(axes: Axes, text: str) -> None:
+    """Set the title of axes, left-aligned with them."""
+    if text:
+        axes.set_title(text, fontsize=NORMAL, family=FAMILY, color=INK, loc="left", pad=5.0, parse_math=False)
+
+
+def write(axes: Axes, x: float, y: float, text: str, **options: Any) -> Artist:
+    """Write small text into axes; `options` are those of `Axes.text`."""
+    settings: dict[str, Any] = {"fontsize": SMALL, "family": FAMILY, "color": INK, "parse_math": False}
+    return axes.text(x, y, text, **(settings | options))
+
+
+def legend(owner: Axes | Figure, entries: Sequence[tuple[Any, str]], **options: Any) -> Legend:
+    """Add a frameless legend; unlike matplotlib's own, it takes any text as a name, also one with an underscore."""
+    settings: dict[str, Any] = {
+        "prop": {"family": FAMILY, "size": SMALL},
+        "frameon": False,
+        "handlelength": 1.8,
+        "handletextpad": 0.5,
+        "columnspacing": 1.4,
+        "borderaxespad": 0.3,
+        "labelcolor": INK,
+    }
+    made = owner.legend([artist for artist, _ in entries], ["-"] * len(entries), **(settings | options))
+    for text, (_, name) in zip(made.get_texts(), entries, strict=True):
+        text.set_parse_math(False)
+        text.set_text(name)
+    return made
+
+
+def shorten(name: str, length: int = 26) -> str:
+    """Cut a name that would not fit.
+
+    >>> shorten("tuned_q_learning", 10)
+    'tuned_q_l…'
+    """
+    return name if len(name) <= length else name[: length - 1] + "…"
+
+
+def mark_drifts(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64]) -> LineCollection:
+    """Mark true drifts: broad light bands behind the data, one per x in `at`."""
+    return _verticals(axes, at, "drift", colors=BAND, linewidths=2.6, zorder=0.8)
+
+
+def mark_alarms(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64]) -> LineCollection:
+    """Mark alarms: thin dashed dark lines over the data, one per x in `at`."""
+    return _verticals(axes, at, "alarm", colors=INK, linewidths=0.7, linestyles=[(0, (3.0, 1.6))], zorder=3.0)
+
+
+def drift_handle() -> Line2D:
+    """Return a legend's sample of a drift."""
+    return Line2D([], [], color=BAND, linewidth=2.6)
+
+
+def alarm_handle() -> Line2D:
+    """Return a legend's sample of an alarm."""
+    return Line2D([], [], color=INK, linewidth=0.7, linestyle=(0, (3.0, 1.6)))
+
+
+def _verticals(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64], gid: str, **options: Any) -> LineCollection:
+    lines = LineCollection([[(x, 0.0), (x, 1.0)] for x in at], transform=axes.get_xaxis_transform(), **options)
+    lines.set_gid(gid)
+    lines.set_capstyle("butt")
+    axes.add_collection(lines, autolim=False)
+    return lines
+
+
+def number(value: float, resolution: float) -> str:
+    """Write a number with thousands separated and as many decimals as `resolution` calls for.
+
+    >>> number(23348.123, 90.0), number(-340.26, 0.8), number(5.9, 0.0)
+    ('23,348', '−340.3', '5.9')
+    """
+    size = resolution if resolution > 0.0 else abs(value) / 10.0
+    decimals = 0 if size == 0.0 else min(6, max(0, -math.floor(math.log10(size))))
+    return f"{value:,.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as ``NAME.png`` (200 dpi) and ``NAME.pdf`` (vector, text as TrueType) into a folder.
+
+    Both are drawn and written beside their places before the first takes its name, so a full disk leaves what was
+    there before. The files hold no date: equal figures have equal bytes, for equal versions of matplotlib. The first
+    save fixes the layout; what is added to a figure later gets no room of its own.
+
+    Parameters
+    ----------
+    figure
+        What to write.
+    folder
+        Where to; made if missing.
+    name
+        Name of the files, without an ending.
+
+    Returns
+    -------
+    The two paths, PNG first.
+
+    Raises
+    ------
+    ValueError
+        The name is empty, begins with a dot or holds a path separator.
+    OSError
+        A file cannot be written; nothing half-written stays.
+    """
+    if not name or name.startswith(".") or any(sign in name for sign in "/\\\0"):
+        raise ValueError(f"name is {name!r}; give a file name without folder and ending, such as 'learning_curve'")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
+    parts = [path.with_name(f".{path.name}.{secrets.token_hex(4)}.part") for path in paths]
+    try:
+        for part, data in zip(parts, _drawn(figure), strict=True):
+            with open(part, "xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        for part, path in zip(parts, paths, strict=True):
+            os.replace(part, path)
+    finally:
+        for part in parts:
+            with contextlib.suppress(OSError):
+                part.unlink()
+    return paths
+
+
+def _drawn(figure: Figure) -> tuple[bytes, bytes]:
+    """Draw a figure as PNG and as PDF."""
+    png, pdf = io.BytesIO(), io.BytesIO()
+    # The type of a PDF's fonts can be set for the process only; so one figure is drawn at a time, and it is set back.
+    with _saving:
+        before = matplotlib.rcParams["pdf.fonttype"]
+        matplotlib.rcParams["pdf.fonttype"] = 42
+        try:
+            if figure.get_layout_engine() is not None:
+                # Each layout starts from the last one and moves things by a hair; so it is made once, for both files.
+                figure.draw_without_rendering()
+                figure.set_layout_engine("none")
+            figure.savefig(png, format="png", dpi=PNG_DPI)
+            figure.savefig(pdf, format="pdf", dpi=RASTER_DPI, metadata={"CreationDate": None})
+        finally:
+            matplotlib.rcParams["pdf.fonttype"] = before
+    return png.getvalue(), pdf.getvalue()

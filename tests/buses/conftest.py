@@ -1,0 +1,41 @@
+import logging
+import sys
+from pathlib import Path
+
+import pytest
+
+from adapters.buses import Wire
+
+# pytest imports test modules without a path to their neighbours; `bus_records` and `bus_small_loop` are such.
+sys.path.append(str(Path(__file__).parent))
+
+
+class _Collect(logging.Handler):
+    def __init__(self):
+        super().__init__()
+        self.records = []
+
+    def emit(self, record):
+        self.records.append(self.format(record))
+
+
+@pytest.fixture(autouse=True)
+def no_callback_fails():
+    """Zenoh logs what a callback raises, and goes on."""
+    collect = _Collect()
+    logger = logging.getLogger("zenoh.handlers")
+    logger.addHandler(collect)
+    yield
+    logger.removeHandler(collect)
+    assert collect.records == []
+
+
+@pytest.fixture
+def endpoint(tmp_path_factory):
+    """Name a socket that no other test has, by a path that is short enough for the kernel."""
+    return f"unixsock-stream/{tmp_path_factory.mktemp('z')}/k.sock"
+
+
+@pytest.fixture
+def wire(endpoint):
+    return Wire(endpoint, "example")
