@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import json
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -172,7 +172,7 @@ def from_json(data: bytes | str) -> Record:
     fields["pass_no"] = fields.pop("pass")
     try:
         # Validated from JSON text, where a list may stand for a tuple even in strict mode.
-        record: Record = _adapter(kinds[schema]).validate_json(json.dumps(fields))
+        record: Record = _adapter(cast(Any, kinds[schema])).validate_json(json.dumps(fields))
     except ValueError as error:
         first = error.errors()[0] if hasattr(error, "errors") else {"loc": (), "msg": str(error)}
         where = ".".join(str(part) for part in first["loc"]) or "record"

@@ -83,8 +83,9 @@ class LocalBus:
 def refusal(record: Record, ack: Ack, passes: int) -> BusError:
     """Say why the log, which holds `passes` finished passes, did not take a record."""
     return BusError(
-        f"{type(record).__name__} {record.pass_no} is refused as a {ack.value}: the log holds {passes} finished passes. "
-        "Each stage sends one record per pass, in order, and hands on the signals and action sets that it was given."
+        f"{type(record).__name__} {record.pass_no} is refused as a {ack.value}: the log holds {passes} finished "
+        "passes. Each stage sends one record per pass, in order, and hands on the signals and action sets that it was "
+        "given."
     )
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class MapekError(Exception):
@@ -36,6 +37,10 @@ class UnknownName(ConfigError):
         hint = f"; did you mean {close[0]!r}?" if close else "."
         known = f" Known: {', '.join(legal)}." if legal else ""
         super().__init__(f"unknown {what} {name!r}{hint}{known}{' ' if way_out else ''}{way_out}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Made again of its text, as the others are: a worker process hands it on by pickle.
+        return ConfigError, self.args
 
 
 class PartError(MapekError):

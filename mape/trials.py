@@ -78,7 +78,7 @@ def run_trial(
         )
     except MapekError as error:
         if config.trials > 1 and not str(error).startswith("trial "):
-            raise type(error)(f"trial {trial}: {error}") from error
+            error.args = (f"trial {trial}: {error}",)
         raise
     finally:
         system.close()

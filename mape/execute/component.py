@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from knowledge import ChangePlan, Knowledge, Observation, QTable
-from mape.compose import Composed, specialise
 from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
-from mape.execute import drive, episode
+from mape.execute import binding, episode
+from mape.execute.refusals import refused
 from mape.execute.rules import rate_array
 from mape.ports import Episode, Learner, ManagedSystem
 
 SIGNALS = ("return", "steps", "td_error", "q_change")
-"""Signals of every run: return, steps, mean absolute TD error, largest absolute change of Q; the system's own follow."""
+"""Signals of every run: return, steps, mean |TD error|, largest absolute change of Q; the system's own follow."""
 
 DRAWS_AT_ONCE = 8192
 """Uniforms drawn from the trial's generator in one go: cheaper per pass, and the same stream."""
@@ -81,7 +81,8 @@ class Execute:
 
         if engine == "compiled" and system.rules is None:
             raise ConfigError(
-                f"engine 'compiled' needs a system that offers its rules; {system.name} does not. Choose 'auto' or 'python'."
+                f"engine 'compiled' needs a system that offers its rules; {system.name} does not. Choose 'auto' or "
+                "'python'."
             )
         self._rules = None if engine == "python" else system.rules
         reset_draws, step_draws = system.draws
@@ -109,7 +110,11 @@ class Execute:
             first = self._begin(1, np.zeros(self._width))
         self._take_actions(first, 1)
         self._set_table(QTable(first, system.n_states))
-        self._drive = self._bind()
+        self._drive = (
+            binding.by_calls(learner)
+            if self._rules is None
+            else binding.by_rules(self._rules, learner, (1, 0.5, 0, self._no_trace, *self._fixed))
+        )
         knowledge.serve_q_table(lambda: self.q_table.copy())
 
     def record_trace(self, first: int, last: int, listener: Callable[[int, npt.NDArray[np.float64]], object]) -> None:
@@ -182,7 +187,7 @@ class Execute:
             ) from error
         if status != episode.OK:
             self._roll_back()
-            raise self._refused(status, number, steps, total, td_error, change)
+            raise refused(status, self.system, number, steps, (total, td_error, change))
         signals = {"return": total, "steps": float(steps), "td_error": td_error, "q_change": change}
         if self._own_signals:
             self._add_own_signals(signals, number)
@@ -210,31 +215,6 @@ class Execute:
     def compiled(self) -> bool:
         """Whether an episode is one compiled call."""
         return self._rules is not None
-
-    def _bind(self) -> Callable[..., tuple[int, int, float, float, float]]:
-        rules = self._rules
-        learner = {"value": self.learner.value, "step_size": self.learner.step_size}
-        if rules is None:
-            plain = Composed(
-                episode.episode,
-                {
-                    "begin": drive.begin_by_calls,
-                    "act": drive.act_by_calls,
-                    "explorable": drive.explorable_by_calls,
-                    **learner,
-                },
-            ).python()
-
-            def quiet(*arguments: Any) -> Any:
-                # What overflows is refused by the episode itself, with the number in the message.
-                with np.errstate(all="ignore"):
-                    return plain(*arguments)
-
-            return quiet
-        begin = Composed(drive.begin_by_rules, {"phase_rule": rules.phase, "reset_rule": rules.reset})
-        act = Composed(drive.act_by_rules, {"step_rule": rules.step})
-        bound = Composed(episode.episode, {"begin": begin, "act": act, "explorable": rules.explorable, **learner})
-        return specialise(bound.compiled(), (1, 0.5, 0, self._no_trace, *self._fixed))
 
     def _fix_arguments(self) -> None:
         # What stays from episode to episode, in the order of `episode.episode`.
@@ -341,26 +321,3 @@ class Execute:
         values[self._journal[:used]] = self._saved[:used]
         # Driven again, the episode saves these pairs anew.
         self._touched.reshape(-1)[self._journal[:used]] = 0
-
-    def _refused(
-        self, status: int, number: int, steps: int, first: float, action: float, td_error: float
-    ) -> ManagedSystemError:
-        where = f"in episode {number} at step {steps}"
-        kept = f"Nothing of that episode was learnt; the {self.passes} passes before it are kept."
-        if status == episode.OFF_TABLE:
-            return ManagedSystemError(
-                f"{self.system.name} went to state {int(first)} {where}; its states are 0 .. {self.system.n_states - 1}. {kept}"
-            )
-        if status == episode.OVERFLOW:
-            return NonFiniteError(
-                f"the return of episode {number} became {first}, its mean absolute TD error {action}, its largest change "
-                f"of Q {td_error}: too large for a float. {kept} Scale the rewards down."
-            )
-        if isfinite(first):
-            return NonFiniteError(
-                f"the TD error became {td_error} {where} (reward {first}, action {int(action)}): the Q-values diverge. "
-                f"{kept} Lower discount, alpha or the rewards."
-            )
-        return NonFiniteError(
-            f"{self.system.name} gave reward {first} for action {int(action)} {where}; rewards are finite numbers. {kept}"
-        )

@@ -32,8 +32,8 @@ class Monitor:
         for name, detector in self.detectors:
             if (direction := getattr(detector, "direction", None)) not in DIRECTIONS:
                 raise PartError(
-                    f"detector {type(detector).__name__} on {name} watches the side {direction!r}; its direction is one "
-                    f"of {', '.join(DIRECTIONS)}"
+                    f"detector {type(detector).__name__} on {name} watches the side {direction!r}; its direction is "
+                    f"one of {', '.join(DIRECTIONS)}"
                 )
         self._send = send
 

@@ -53,7 +53,8 @@ class Plan:
     def _put(self, plan: ChangePlan, number: int) -> None:
         if type(plan) is not ChangePlan:
             raise PartError(
-                f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a ChangePlan"
+                f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a "
+                "ChangePlan"
             )
         epsilon = plan.epsilon
         if not (isinstance(epsilon, float | int) and 0.0 <= epsilon <= 1.0):

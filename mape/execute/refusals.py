@@ -1,0 +1,35 @@
+"""What is said of an episode that was broken off, and not learnt from."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from mape.errors import ManagedSystemError, NonFiniteError
+from mape.execute import episode
+from mape.ports import ManagedSystem
+
+
+def refused(
+    status: int, system: ManagedSystem, number: int, steps: int, fault: tuple[float, float, float]
+) -> ManagedSystemError:
+    """Turn a status of `episode.episode` other than OK, and the three numbers it came with, into an error."""
+    first, action, last = fault
+    where = f"in episode {number} at step {steps}"
+    kept = f"Nothing of that episode was learnt; the {number - 1} passes before it are kept."
+    if status == episode.OFF_TABLE:
+        return ManagedSystemError(
+            f"{system.name} went to state {int(first)} {where}; its states are 0 .. {system.n_states - 1}. {kept}"
+        )
+    if status == episode.OVERFLOW:
+        return NonFiniteError(
+            f"the return of episode {number} became {first}, its mean absolute TD error {action}, its largest change of "
+            f"Q {last}: too large for a float. {kept} Scale the rewards down."
+        )
+    if isfinite(first):
+        return NonFiniteError(
+            f"the TD error became {last} {where} (reward {first}, action {int(action)}): the Q-values diverge. {kept} "
+            "Lower discount, alpha or the rewards."
+        )
+    return NonFiniteError(
+        f"{system.name} gave reward {first} for action {int(action)} {where}; rewards are finite numbers. {kept}"
+    )

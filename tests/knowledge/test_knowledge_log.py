@@ -1,0 +1,245 @@
+import hashlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from knowledge_strategies import one_pass, plan
+
+import knowledge.log
+from knowledge import Ack, ChangePlan, ChangeRequest, Log, Observation, RowLayout, Symptom
+
+
+def fresh(window=256):
+    return Log(RowLayout(("return",), detectors=1, rates=3), window=window)
+
+
+def filled(passes, window=256, listener=None):
+    log = fresh(window)
+    if listener is not None:
+        log.on_rows(listener)
+    assert log.append(plan(0)) is Ack.OK
+    for number in range(1, passes + 1):
+        for record in one_pass(number, alarm=number % 5 == 0):
+            assert log.append(record) is Ack.OK
+    return log
+
+
+def test_the_records_of_a_run_are_taken_in_their_order():
+    log = filled(7)
+    assert log.passes == 7
+    assert log.window[-1] == one_pass(7)
+
+
+def test_a_record_sent_again_is_a_duplicate_and_changes_nothing():
+    log = filled(4)
+    before = log.sha256()
+    for number in range(1, 5):
+        for record in one_pass(number):
+            assert log.append(record) is Ack.DUPLICATE
+    assert log.append(plan(0)) is Ack.DUPLICATE
+    assert (log.passes, log.sha256()) == (4, before)
+
+
+def test_a_record_of_the_open_pass_sent_again_is_a_duplicate():
+    log = filled(2)
+    seen, symptom, _, _ = one_pass(3)
+    log.append(seen)
+    assert log.append(seen) is Ack.DUPLICATE
+    log.append(symptom)
+    assert log.append(seen) is Ack.DUPLICATE
+    assert log.append(symptom) is Ack.DUPLICATE
+
+
+def test_a_record_before_its_turn_is_a_gap_and_changes_nothing():
+    log = filled(2)
+    before = log.sha256()
+    early = (*one_pass(3)[1:], *one_pass(4), *one_pass(9))
+    assert {log.append(record) for record in early} == {Ack.GAP}
+    assert (log.passes, log.sha256()) == (2, before)
+    assert log.append(one_pass(3)[0]) is Ack.OK
+
+
+def test_nothing_comes_before_plan_0():
+    log = fresh()
+    assert {log.append(record) for record in one_pass(1)} == {Ack.GAP}
+    assert log.append(plan(0)) is Ack.OK
+
+
+@pytest.mark.parametrize("number", [0, -1, -2])
+def test_passes_are_counted_from_1(number):
+    with pytest.raises(ValueError, match="counted from 1"):
+        fresh().append(one_pass(1)[0]._replace(pass_no=number))
+    with pytest.raises(ValueError, match="counted from 1"):
+        filled(2).append(one_pass(1)[0]._replace(pass_no=number))
+
+
+def test_another_record_in_a_taken_place_is_a_conflict():
+    log = filled(3)
+    before = log.sha256()
+    assert log.append(plan(0, epsilon=0.25)) is Ack.CONFLICT
+    assert log.append(one_pass(2)[0]._replace(steps=1)) is Ack.CONFLICT
+    assert log.append(one_pass(3)[3]._replace(epsilon=0.0)) is Ack.CONFLICT
+    log.append(one_pass(4)[0])
+    assert log.append(one_pass(4)[0]._replace(steps=1)) is Ack.CONFLICT
+    assert log.sha256() == before
+
+
+def test_a_record_older_than_the_window_is_a_duplicate_without_a_comparison():
+    log = filled(10, window=3)
+    assert log.append(one_pass(7)[0]._replace(steps=1)) is Ack.DUPLICATE
+    assert log.append(one_pass(8)[0]._replace(steps=1)) is Ack.CONFLICT
+
+
+def test_a_stage_that_hands_on_other_signals_or_actions_is_in_conflict():
+    seen, symptom, request, chosen = one_pass(1)
+    log = filled(0)
+    log.append(seen)
+    assert log.append(symptom._replace(signals={"return": 0.0})) is Ack.CONFLICT
+    assert log.append(symptom._replace(available=(0,))) is Ack.CONFLICT
+    assert log.append(symptom._replace(known=(0, 1, 2))) is Ack.CONFLICT
+    assert log.append(symptom) is Ack.OK
+    assert log.append(request._replace(signals={"return": 0.0})) is Ack.CONFLICT
+    assert log.append(request) is Ack.OK
+    assert log.append(chosen) is Ack.OK
+    assert log.sha256() == filled(1).sha256()
+
+
+def test_what_is_handed_on_may_be_an_equal_copy():
+    seen, symptom, request, chosen = one_pass(1)
+    log = filled(0)
+    for record in (
+        seen,
+        symptom._replace(signals=dict(seen.signals)),
+        request._replace(signals=dict(seen.signals)),
+        chosen,
+    ):
+        assert log.append(record) is Ack.OK
+
+
+def test_a_record_of_another_loop_is_refused():
+    with pytest.raises(ValueError, match="loop 1 was sent to the log of loop 0"):
+        filled(1).append(one_pass(2)[0]._replace(loop=1))
+
+
+def test_a_plan_that_does_not_fit_the_layout_is_refused_and_its_place_stays_free():
+    log = filled(1)
+    seen, symptom, request, chosen = one_pass(2)
+    for record in (seen, symptom, request):
+        log.append(record)
+    before = log.sha256()
+    for bad in (chosen._replace(learning_rate=(0.1,)), chosen._replace(add=(64,)), chosen._replace(adopt="no hash")):
+        with pytest.raises(ValueError, match=r"layout|outside|hexadecimal"):
+            log.append(bad)
+    assert (log.passes, log.sha256()) == (1, before)
+    assert log.append(chosen) is Ack.OK
+    assert log.sha256() == filled(2).sha256()
+
+
+def test_the_window_holds_the_newest_passes():
+    log = filled(10, window=4)
+    assert [finished.observation.pass_no for finished in log.window] == [7, 8, 9, 10]
+
+
+def test_find_returns_a_record_by_kind_and_number():
+    log = filled(10, window=4)
+    log.append(one_pass(11)[0])
+    assert log.find(ChangePlan, 0) == plan(0)
+    assert log.find(Symptom, 8) == one_pass(8)[1]
+    assert log.find(Observation, 11) == one_pass(11)[0]
+    for kind, number in ((Symptom, 11), (Observation, 6), (Observation, 12), (Observation, 0), (ChangeRequest, -1)):
+        assert log.find(kind, number) is None
+
+
+def test_since_yields_what_follows_in_order():
+    log = filled(4)
+    log.append(one_pass(5)[0])
+    log.append(one_pass(5)[1])
+    everything = [plan(0), *(r for n in range(1, 5) for r in one_pass(n)), *one_pass(5)[:2]]
+    assert list(log.since(0)) == everything
+    assert list(log.since(3, 2)) == everything[1 + 2 * 4 + 2 :]
+    assert list(log.since(5)) == everything[-2:]
+    assert list(log.since(5, 1)) == everything[-1:]
+    assert list(log.since(6)) == []
+    assert list(log.since(9, 3)) == []
+
+
+def test_since_says_what_has_left_the_window():
+    with pytest.raises(LookupError, match="the oldest pass in memory is 7"):
+        list(filled(10, window=4).since(6))
+    assert len(list(filled(10, window=4).since(7))) == 16
+
+
+@given(st.integers(0, 40), st.sampled_from([1, 2, 7, 512]))
+def test_the_hash_is_that_of_the_schema_plan_0_and_the_rows_as_numpy_reads_them(passes, segment):
+    segments = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(knowledge.log, "SEGMENT", segment)
+        log = filled(passes, listener=lambda rows: segments.append(rows.copy()))
+        log.flush()
+    layout = log.layout
+    start = np.zeros(1, layout.dtype)
+    start["next_epsilon"] = 0.5
+    start["statistic"] = np.nan
+    start["direction"] = 3
+    start["learning_rate"] = (0.1, 0.9, 5.0)
+    digest = hashlib.sha256(layout.schema + start.tobytes())
+    for rows in segments:
+        digest.update(np.ascontiguousarray(rows).tobytes())
+    assert log.sha256() == digest.hexdigest()
+    assert sum(map(len, segments)) == passes
+
+
+def test_the_hash_does_not_depend_on_when_rows_are_handed_on():
+    plain = filled(9)
+    flushed = fresh()
+    flushed.append(plan(0))
+    for number in range(1, 10):
+        for record in one_pass(number, alarm=number % 5 == 0):
+            flushed.append(record)
+            flushed.flush()
+    assert plain.sha256() == flushed.sha256()
+
+
+def test_asking_for_the_hash_does_not_change_it():
+    log = filled(3)
+    assert log.sha256() == log.sha256() == filled(3).sha256()
+
+
+def test_the_hash_tells_runs_apart():
+    hashes = {filled(passes).sha256() for passes in range(5)}
+    other = fresh()
+    other.append(plan(0, epsilon=0.25))
+    hashes.add(other.sha256())
+    wider = Log(RowLayout(("cost",), detectors=1, rates=3))
+    wider.append(plan(0))
+    hashes.add(wider.sha256())
+    assert len(hashes) == 7
+
+
+def test_segments_reach_every_listener_once_and_cannot_be_written(monkeypatch):
+    monkeypatch.setattr(knowledge.log, "SEGMENT", 4)
+    seen, also = [], []
+    log = fresh()
+    log.on_rows(lambda rows: seen.extend(rows["pass"].tolist()))
+    log.on_rows(lambda rows: also.append(rows.flags.writeable))
+    log.append(plan(0))
+    for number in range(1, 11):
+        for record in one_pass(number):
+            log.append(record)
+    assert seen == list(range(1, 9))
+    log.flush()
+    log.flush()
+    assert seen == list(range(1, 11))
+    assert also == [False] * 3
+
+
+def test_a_row_says_what_its_pass_was():
+    rows = []
+    filled(5, listener=lambda segment: rows.append(segment.copy())).flush()
+    row = rows[0][4]
+    assert (row["pass"], row["plan"], row["steps"], row["epsilon"], row["next_epsilon"]) == (5, 4, 15, 0.5, 0.2)
+    assert row["signals"].tolist() == [-5.0]
+    assert (row["value"][0], row["alarm"][0], row["direction"][0], row["drift"][0]) == (-5.0, True, 1, 1)
+    assert np.isnan(row["statistic"][0])
+    assert row["add"].tolist() == [0b100]
