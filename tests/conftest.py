@@ -7,9 +7,8 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, settings
 
-# pytest put this folder on the path, where the tests' folders `knowledge` and `mape` would be taken for the packages.
-_HERE = Path(__file__).parent
-sys.path[:] = [entry for entry in sys.path if Path(entry) != _HERE]
+# pytest imports test modules without a path to their neighbours, such as `mape_runs`.
+sys.path += [str(Path(__file__).parent / folder) for folder in ("knowledge", "mape")]
 
 # One folder for all runs and workers: compiling the episode takes seconds, and its name holds a hash of the sources.
 _CACHE = Path(tempfile.gettempdir(), f"mapek-test-cache-{os.getuid()}")

@@ -57,7 +57,9 @@ def _kind_of(name: str) -> str:
         if is_registered(name):
             return "system"
         known = {part for parts in registry.PARTS.values() for part in parts}
-        raise UnknownName("part or system", name, known, 'A part of your own is "module:Class", a system a Gymnasium id.')
+        raise UnknownName(
+            "part or system", name, known, 'A part of your own is "module:Class", a system a Gymnasium id.'
+        )
     part = registry.find("detector", name)
     if inspect.isclass(part):
         for kind, members in _MEMBERS.items():

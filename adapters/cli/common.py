@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from adapters import detectors
-from adapters.experiments.runner import announce_compilation
+from adapters.experiments.runner import announce_compilation, check
 from adapters.experiments.statistics import finite
 from adapters.results import RunFolder
-from adapters.results.files import write_json
+from adapters.results.files import cannot_write, write_json
 from adapters.results.folder import default_path
 from mape.config import Config, load
+from mape.errors import ConfigError
 
 
 def prepare() -> None:
@@ -39,23 +41,38 @@ def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = 
 
 
 def open_folder(chosen: argparse.Namespace, kind: str, name: str, configs: Mapping[str, Config]) -> RunFolder:
-    """Open the folder that the command line names, or a new one, and say if it is continued."""
+    """Open the folder that the command line names, or a new one, and say if it is continued.
+
+    What is wrong with a config is said before: no folder is begun that could not be gone on with.
+    """
     check_json_target(chosen)
+    for agent, config in configs.items():
+        check_name(agent)
+        check(config)
     folder = RunFolder(Path(chosen.out) if chosen.out else default_path(name), kind, configs)
     if folder.resumed:
         say(chosen, f"continuing in {folder.path}: {folder.resumed} trials are finished already")
     return folder
 
 
+def check_name(agent: str) -> None:
+    """Refuse an agent whose name cannot be part of a file's name."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", agent):
+        raise ConfigError(
+            f"agent {agent!r} gives its name to files; let it begin with a letter or digit, of at most 64 letters, digits, "
+            "_ . or -"
+        )
+
+
 def check_json_target(chosen: argparse.Namespace) -> None:
     """Refuse a --json that cannot be written before the work is done, not after."""
-    from mape.errors import ConfigError
-
     if chosen.json in (None, "-"):
         return
     path = Path(chosen.json)
-    if path.is_dir() or not path.absolute().parent.is_dir():
-        raise ConfigError(f"--json {chosen.json!r}: there is no folder {str(path.parent)!r} to hold it, or it is a folder")
+    if path.is_dir():
+        raise ConfigError(f"--json {chosen.json!r} is a folder; name a file, or - for standard output")
+    if not path.absolute().parent.is_dir():
+        raise ConfigError(f"--json {chosen.json!r}: there is no folder {str(path.parent)!r} to hold it; make it first")
 
 
 def say(chosen: argparse.Namespace, text: str = "") -> None:
@@ -72,10 +89,15 @@ def finish(chosen: argparse.Namespace, folder: RunFolder, result: Mapping[str, A
     elif chosen.json:
         target = Path(chosen.json)
         if target.exists() and not target.is_file():  # a device or a pipe cannot be replaced
-            with open(target, "w", encoding="utf-8") as file:
-                json.dump(result, file, indent=2, allow_nan=False)
+            try:
+                with open(target, "w", encoding="utf-8") as file:
+                    json.dump(result, file, indent=2, allow_nan=False)
+            except OSError as error:
+                raise cannot_write(target, error, f"The run is complete; all of it is in {folder.path}.") from error
         else:
             write_json(target, result)
     if figures:
-        say(chosen, f"figures:  {folder.path / 'figures'} ({', '.join(sorted({p.stem for p in figures}))}; PNG and PDF)")
+        say(
+            chosen, f"figures:  {folder.path / 'figures'} ({', '.join(sorted({p.stem for p in figures}))}; PNG and PDF)"
+        )
     say(chosen, f"results:  {folder.path}")

@@ -78,14 +78,16 @@ def _configs(chosen: argparse.Namespace) -> dict[str, Config]:
         raise UnknownName("agent", sorted(unused)[0], [a for p in chosen.configs for a in overlays_of(p, "agent")])
     if len(found) < 2:
         raise ConfigError(
-            f"compare needs two things to compare; {chosen.configs[0]} has no [agents.NAME] tables. Give several configs."
+            f"compare needs two things to compare, and found {next(iter(found))!r} alone. Give several configs, or one "
+            "with [agents.NAME] tables, all of which are compared unless --agents names some."
         )
     for what in ("seed", "trials", "episodes"):
         values = {label: getattr(config, what) for label, config in found.items()}
         if len(set(values.values())) > 1:
             given = ", ".join(f"{label} {value}" for label, value in values.items())
             hint = f"--{what} N" if what != "episodes" else "--set episodes=N"
-            raise ConfigError(f"a fair comparison has one {what} for all: {given}. Give {hint}.")
+            named = what if what == "seed" else f"number of {what}"
+            raise ConfigError(f"a fair comparison has one {named} for all: {given}. Give {hint}.")
     return found
 
 
@@ -98,7 +100,10 @@ def _print(
     corrected: list[float | None],
 ) -> None:
     some = configs[first]
-    say(chosen, f"{len(rows)} agents, {some.trials:,} trials of {some.episodes:,} episodes each, seeds from {some.seed}\n")
+    say(
+        chosen,
+        f"{len(rows)} agents, {some.trials:,} trials of {some.episodes:,} episodes each, seeds from {some.seed}\n",
+    )
     width = max(len(agent) for agent in rows)
     say(chosen, f"{'':<{width}}{'total return':>26}{'95 % interval':>26}{'total steps':>22}{'alarms':>9}")
     for agent, row in rows.items():
@@ -109,7 +114,10 @@ def _print(
             f"{agent:<{width}}{_with_sd(total):>26}{interval:>26}{_with_sd(steps):>22}{row['alarms']:>9.2f}",
         )
     say(chosen, f"\nagainst {first}, total return")
-    say(chosen, f"{'':<{width}}{'difference':>14}{'95 % interval':>28}{'effect size g':>15}{'Welch t':>10}{'p (Holm)':>11}")
+    say(
+        chosen,
+        f"{'':<{width}}{'difference':>14}{'95 % interval':>28}{'effect size g':>15}{'Welch t':>10}{'p (Holm)':>11}",
+    )
     for (agent, found), p in zip(against.items(), corrected, strict=True):
         interval = "" if found.interval is None else "[{:+,.0f}, {:+,.0f}]".format(*found.interval)
         g = "-" if found.hedges_g is None else f"{found.hedges_g:+.2f}"

@@ -6,6 +6,7 @@ Exit codes: 0 done; 1 failure; 2 usage, a config among it; 130 after Ctrl-C, wit
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -43,7 +44,9 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
     _what_runs(run)
     _where_to(run)
-    run.add_argument("--show", type=_span, metavar="FROM:TO", help="print the four records of these passes as sentences")
+    run.add_argument(
+        "--show", type=_span, metavar="FROM:TO", help="print the four records of these passes as sentences"
+    )
     run.add_argument("--trace", type=_span, metavar="FROM:TO", help="keep every step of these episodes of trial 0")
 
     compare = commands.add_parser(
@@ -51,7 +54,9 @@ def parser() -> argparse.ArgumentParser:
         help="several configs, or all agents of one, on the same seeds",
         description="Run configs on the same seeds: one table, with effect sizes, intervals and tests.",
     )
-    compare.add_argument("configs", nargs="+", metavar="CONFIG", help="config files; one alone is compared over its agents")
+    compare.add_argument(
+        "configs", nargs="+", metavar="CONFIG", help="config files; one alone is compared over its agents"
+    )
     compare.add_argument("--agents", metavar="A,B", help="of the configs' agents, only these")
     _what_runs(compare)
     _where_to(compare)
@@ -71,7 +76,9 @@ def parser() -> argparse.ArgumentParser:
     step.add_argument("config", metavar="CONFIG")
     step.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
     _overlays(step)
-    step.add_argument("--from", dest="first", type=_positive, default=1, metavar="PASS", help="run up to this pass first")
+    step.add_argument(
+        "--from", dest="first", type=_positive, default=1, metavar="PASS", help="run up to this pass first"
+    )
 
     commands.add_parser("list", help="systems, detectors, planners, schedules, learners: one line each")
 
@@ -101,16 +108,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         top.print_help()
         return 2
     try:
-        return _dispatch(chosen)
+        code = _dispatch(chosen)
+        sys.stdout.flush()  # here, where what goes wrong can still be said
+        return code
     except KeyboardInterrupt:
         print("stopped.", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # The reader has gone (`mapek list | head`); Python would complain once more when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence()
         return 1
     except Exception as error:
         return _failed(error)
+
+
+def _silence() -> None:
+    # What is still in the buffer would be tried once more at exit.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(chosen: argparse.Namespace) -> int:
@@ -124,6 +138,11 @@ def _dispatch(chosen: argparse.Namespace) -> int:
 def _failed(error: Exception) -> int:
     from mape.errors import ConfigError, MapekError
 
+    if isinstance(error, OSError) and error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EIO):
+        # Files of ours are written elsewhere, and named; what is left is standard output.
+        print(f"mapek: standard output cannot be written: {error.strerror}. Lead it to another place.", file=sys.stderr)
+        _silence()
+        return 1
     if not isinstance(error, MapekError):
         raise error
     print(f"mapek: {error}", file=sys.stderr)

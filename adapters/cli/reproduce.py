@@ -198,7 +198,10 @@ def _traffic(
             "detection": [d._asdict() for d in met],
             "detection_initial": initial,
         }
-    say(chosen, f"\nDetection by Page-Hinkley\n{'agent, drift at':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}")
+    say(
+        chosen,
+        f"\nDetection by Page-Hinkley\n{'agent, drift at':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}",
+    )
     for agent in configs:
         if configs[agent].monitor.detectors:
             say(chosen, agent)
@@ -229,22 +232,31 @@ def _jump(
     before_at, after_at = (max(1, change - 20), change - 1), (max(1, config.episodes - 19), config.episodes)
     optimum = shortest_path(system, config.episodes)
     say(chosen, f"Jump, {config.trials:,} trials per agent; the shortest path at the end has {optimum} steps")
-    say(chosen, f"\n{'mean steps over episodes':<26}{'':<8}{'%d-%d' % before_at:>10}{'%d-%d' % after_at:>10}{'optimal':>10}")
+    say(
+        chosen,
+        f"\n{'mean steps over episodes':<26}{'':<8}{'%d-%d' % before_at:>10}{'%d-%d' % after_at:>10}{'optimal':>10}",
+    )
     found: dict[str, Any] = {}
     for agent in configs:
         steps = folder.episodes(agent, "steps")["steps"].astype(float)
-        means = [float(steps[:, first - 1 : last].mean()) for first, last in (before_at, after_at)]
+        means = [_mean_over(steps, *episodes) for episodes in (before_at, after_at)]
         tables = folder.q_tables(agent)
         available = system.available(config.episodes) or ()
         lengths = [greedy_length(q, ids, system.rules, config.episodes, available) for q, ids in tables.values()]
         share = float(np.mean([length == optimum for length in lengths]))
-        say(chosen, f"{agent:<26}{'found':<8}{means[0]:>10.2f}{means[1]:>10.2f}{share:>10.3f}")
+        said = ["-" if mean is None else f"{mean:.2f}" for mean in means]
+        say(chosen, f"{agent:<26}{'found':<8}{said[0]:>10}{said[1]:>10}{share:>10.3f}")
         target = paper.JUMP[agent]
         say(chosen, f"{'':<26}{'target':<8}{target[0]:>10.2f}{target[1]:>10.2f}{target[2]:>10.3f}")
         found[agent] = {"steps_before": means[0], "steps_after": means[1], "optimal_share": share}
     system.close()
     say(chosen, "\noptimal: share of trials whose greedy path at the end is a shortest one.")
     return {"agents": found, "shortest_path": optimum}
+
+
+def _mean_over(steps: npt.NDArray[Any], first: int, last: int) -> float | None:
+    """Return the mean over episodes `first` to `last`; None where the run is shorter."""
+    return float(steps[:, first - 1 : last].mean()) if last <= steps.shape[1] else None
 
 
 def shortest_path(system: Any, episode: int) -> int | None:

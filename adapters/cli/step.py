@@ -24,7 +24,8 @@ def execute(chosen: argparse.Namespace) -> int:
     loop = Loop(config, make_system(config.system))
     try:
         print(f"{config.name}, trial 0, seed {config.seed}. {HELP}.")
-        loop.run(chosen.first - 1)
+        if chosen.first > 1:
+            loop.run(chosen.first - 1)
         while loop.log.passes < config.episodes:
             answer = _ask(f"[pass {loop.log.passes + 1}] ")
             if answer is None or answer in ("q", "quit", "exit"):

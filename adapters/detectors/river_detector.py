@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import math
 from typing import Any
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -54,8 +55,8 @@ def river_class(name: str) -> Any:
         classes = _classes()
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"River's detector {name!r} needs the package {error.name!r}, which is not installed: "
-            'pip install "mapek[river]"'
+            f"River's detector {name!r} needs the package {(error.name or 'river').partition('.')[0]!r}, which is not "
+            'installed: pip install "mapek[river]"'
         ) from None
     if name not in classes:
         raise UnknownName("detector of River", name, classes)
@@ -84,9 +85,11 @@ class RiverConfig(PartConfig):
         if "detector" in info.data:
             detector = info.data["detector"]
             legal = inspect.signature(river_class(detector)).parameters
-            for name in options:
+            for name, value in options.items():
                 if name not in legal:
                     raise ValueError(str(UnknownName(f"option of River's {detector}", name, legal)))
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise ValueError(f"{name} = {value} is not a finite number")
         return options
 
 

@@ -1,4 +1,4 @@
-"""What arXiv 2601.20714 prints, and what its numbers were found to need. To be held against, never to be copied from."""
+"""What arXiv 2601.20714 prints, and what was found with its settings: to be held against, never to be copied from."""
 
 from __future__ import annotations
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.connection
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -25,6 +27,10 @@ from mape.trials import TrialResult, chunks, each_completed
 
 CHUNK_SECONDS = 0.8
 PASS_SECONDS, STEP_SECONDS = 20e-6, 10e-6  # rough costs of a pass, and of a step that is not compiled
+
+
+Task = tuple[str, int, int, str, tuple[int, int] | None]
+"""Arguments of `run_chunk`."""
 
 
 class Stopped(MapekError):
@@ -67,9 +73,9 @@ def run_agents(
         A trial failed, or the disk is full.
     """
     finished = {agent: folder.finished(agent) for agent in configs}
-    tasks: list[tuple[Any, ...]] = []
+    tasks: list[Task] = []
     for agent, config in configs.items():
-        compiled = _check(config)
+        compiled = check(config)
         missing = [trial for trial in range(config.trials) if trial not in finished[agent]]
         for first, count in chunks(missing, chunk_size(config, compiled)):
             tasks.append((config.to_json(), first, count, folder.chunk_stem(agent, first, count), trace))
@@ -106,9 +112,17 @@ def chunk_size(config: Config, compiled: bool) -> int:
     return max(1, int(CHUNK_SECONDS / (config.episodes * episode)))
 
 
-def _check(config: Config) -> bool:
-    # In this process first: what is wrong with a config is said at once, and the compiled code is in the cache
-    # before several workers want it.
+def check(config: Config) -> bool:
+    """Make all that a config names, once, and say whether its episodes are compiled.
+
+    In this process first: what is wrong with a config is said at once, and the compiled code is in the cache before
+    several workers want it.
+
+    Raises
+    ------
+    MapekError
+        Something cannot be made.
+    """
     system = make_system(config.system)
     try:
         return Loop(config, system).execute.compiled
@@ -116,7 +130,7 @@ def _check(config: Config) -> bool:
         system.close()
 
 
-def _run_in_workers(tasks: list[tuple[Any, ...]], workers: int, bar: Any) -> None:
+def _run_in_workers(tasks: list[Task], workers: int, bar: Any) -> None:
     # Spawn, never fork: a forked process inherits threads' locks.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
@@ -133,6 +147,15 @@ def _run_in_workers(tasks: list[tuple[Any, ...]], workers: int, bar: Any) -> Non
 def _start_worker() -> None:
     # Ctrl-C reaches the whole process group; the parent alone decides, and lets running chunks end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A parent that is killed can end nobody: the workers would wait for it for ever.
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+
+
+def _leave_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    multiprocessing.connection.wait([parent.sentinel])
+    os._exit(1)
 
 
 def announce_compilation() -> None:

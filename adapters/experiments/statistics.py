@@ -6,6 +6,7 @@ With a thousand trials every p is tiny; what a reader needs is how large a diffe
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -53,7 +54,9 @@ def summary(values: Floats) -> Summary:
     mean = float(values.mean())
     if len(values) < 2:
         return Summary(mean, None, len(values), None)
-    return Summary(mean, float(values.std(ddof=1)), len(values), _interval(np.mean, values))
+    # The mean of equal numbers may be off by a bit, and their deviation then be more than nothing.
+    sd = 0.0 if _constant(values) else float(values.std(ddof=1))
+    return Summary(mean, sd, len(values), _interval(np.mean, values))
 
 
 def compare(first: Floats, second: Floats) -> Comparison:
@@ -63,11 +66,18 @@ def compare(first: Floats, second: Floats) -> Comparison:
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     difference = float(second.mean() - first.mean())
     ratio = float(second.mean() / first.mean()) if first.mean() * second.mean() > 0 else None
-    if min(len(first), len(second)) < 2 or (first.std() == 0 and second.std() == 0):
-        return Comparison(difference, None, ratio, None, None, None, None, None)
-    welch = stats.ttest_ind(second, first, equal_var=False)
     n1, n2 = len(first), len(second)
-    pooled = math.sqrt(((n1 - 1) * first.var(ddof=1) + (n2 - 1) * second.var(ddof=1)) / (n1 + n2 - 2))
+    if min(n1, n2) < 2:
+        return Comparison(difference, None, ratio, None, None, None, None, None)
+    var1, var2 = (0.0 if _constant(sample) else float(sample.var(ddof=1)) for sample in (first, second))
+    error = var1 / n1 + var2 / n2
+    if error == 0:
+        return Comparison(difference, None, ratio, None, None, None, None, None)
+    # By hand: SciPy's own warns of every constant sample, and a deterministic agent gives one.
+    t = difference / math.sqrt(error)
+    share = var1 / n1 / error
+    df = 1.0 / (share**2 / (n1 - 1) + (1.0 - share) ** 2 / (n2 - 1))
+    pooled = math.sqrt(((n1 - 1) * var1 + (n2 - 1) * var2) / (n1 + n2 - 2))
     small = 1.0 - 3.0 / (4.0 * (n1 + n2) - 9.0)
     return Comparison(
         difference,
@@ -75,9 +85,9 @@ def compare(first: Floats, second: Floats) -> Comparison:
         ratio,
         _interval(_ratio, first, second) if ratio is not None else None,
         small * difference / pooled,
-        float(welch.statistic),
-        float(welch.df),
-        float(welch.pvalue),
+        t,
+        df,
+        float(2.0 * stats.t.sf(abs(t), df)),
     )
 
 
@@ -107,6 +117,10 @@ def finite(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
+def _constant(sample: Floats) -> bool:
+    return bool(sample.min() == sample.max())
+
+
 def _difference(first: Floats, second: Floats, axis: int = -1) -> Any:
     return np.mean(second, axis=axis) - np.mean(first, axis=axis)
 
@@ -118,13 +132,23 @@ def _ratio(first: Floats, second: Floats, axis: int = -1) -> Any:
 def _interval(statistic: Callable[..., Any], *samples: Floats) -> tuple[float, float] | None:
     from scipy import stats
 
-    if all(sample.std() == 0 for sample in samples):
+    constant = [_constant(sample) for sample in samples]
+    if all(constant):
         value = float(statistic(*samples))
         return value, value
     # Bias-corrected where the sample is small enough for its jackknife; a large one needs no correction.
-    method = "BCa" if max(len(sample) for sample in samples) <= 2000 and all(s.std() > 0 for s in samples) else "percentile"
-    found = stats.bootstrap(
-        samples, statistic, n_resamples=RESAMPLES, method=method, vectorized=True, batch=500, rng=np.random.default_rng(0)
-    ).confidence_interval
+    method = "BCa" if max(len(sample) for sample in samples) <= 2000 and not any(constant) else "percentile"
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # What it warns of comes back as a number that is not finite, and leaves here as None.
+        warnings.simplefilter("ignore")
+        found = stats.bootstrap(
+            samples,
+            statistic,
+            n_resamples=RESAMPLES,
+            method=method,
+            vectorized=True,
+            batch=500,
+            rng=np.random.default_rng(0),
+        ).confidence_interval
     low, high = float(found.low), float(found.high)
     return (low, high) if math.isfinite(low) and math.isfinite(high) else None

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from adapters import detectors
-from adapters.results.files import read_json, whole, write_json
+from adapters.results.files import read_json, read_npz, whole, write_json
 from adapters.results.table import DTYPE, from_rows
 from adapters.systems import make_system
 from mape.config import from_table
@@ -84,7 +84,7 @@ def run_chunk(
             if trial == 0 and trace is not None:
                 arrays["trace"] = np.concatenate(steps) if steps else np.empty(0, TRACE_DTYPE)
     with whole(path.with_suffix(".npz")) as file:
-        np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez(file, allow_pickle=False, **arrays)
     write_json(
         path.with_suffix(".json"),
         {"rows": count * config.episodes, "rows_sha256": digest.hexdigest(), "trials": [r._asdict() for r in results]},
@@ -105,14 +105,32 @@ def read_chunk(stem: Path) -> list[TrialResult] | None:
     head = read_json(stem.with_suffix(".json"))
     rows = stem.with_suffix(".rows")
     try:
-        if rows.stat().st_size != head["rows"] * DTYPE.itemsize or not stem.with_suffix(".npz").exists():
+        if rows.stat().st_size != head["rows"] * DTYPE.itemsize:
             raise ResultsError(
                 f"{rows} is cut short: {rows.stat().st_size} bytes instead of {head['rows'] * DTYPE.itemsize}. "
                 f"Delete {stem}.* to have these trials run again."
             )
+        stem.with_suffix(".npz").stat()
         return [TrialResult(**{**trial, "alarms": tuple(trial["alarms"])}) for trial in head["trials"]]
     except (OSError, KeyError, TypeError) as error:
         raise ResultsError(f"{stem}.* is damaged ({error}); delete it to have these trials run again") from error
+
+
+def read_arrays(stem: Path) -> dict[str, npt.NDArray[Any]]:
+    """Return a finished chunk's arrays, and hold its rows against their hash.
+
+    Raises
+    ------
+    ResultsError
+        The rows or the arrays are not those that were written.
+    """
+    again = f"Delete {stem}.* and give the same command to have these trials run again."
+    rows = stem.with_suffix(".rows")
+    with open(rows, "rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != read_json(stem.with_suffix(".json"))["rows_sha256"]:
+        raise ResultsError(f"{rows} was changed after it was written: its SHA-256 is {found}. {again}")
+    return read_npz(stem.with_suffix(".npz"), again)
 
 
 def remove_parts(folder: Path) -> None:

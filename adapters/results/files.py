@@ -5,11 +5,19 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+import numpy.typing as npt
+
 from mape.errors import ResultsError
+
+DAMAGE = (OSError, EOFError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What reading an ``.npz`` may raise where its bytes are not those that were written."""
 
 
 @contextlib.contextmanager
@@ -36,12 +44,15 @@ def whole(path: Path) -> Iterator[IO[bytes]]:
         raise
 
 
-def cannot_write(path: Path, error: OSError) -> ResultsError:
+GO_ON = (
+    "What was finished before is kept; make room or choose another place, and give the same command with the same --out "
+    "to go on."
+)
+
+
+def cannot_write(path: Path, error: OSError, way_out: str = GO_ON) -> ResultsError:
     """Say that a file could not be written, and the way out."""
-    return ResultsError(
-        f"{path} cannot be written: {error.strerror or error}. What was finished before is kept; make room or "
-        "choose another place, and give the same command with the same --out to go on."
-    )
+    return ResultsError(f"{path} cannot be written: {error.strerror or error}. {way_out}")
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -65,3 +76,19 @@ def read_json(path: Path) -> Any:
         raise ResultsError(f"{path} cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise ResultsError(f"{path} is damaged ({error}); delete it to have it made again") from error
+
+
+def read_npz(path: Path, way_out: str) -> dict[str, npt.NDArray[Any]]:
+    """Read all arrays of an ``.npz``.
+
+    Raises
+    ------
+    ResultsError
+        It is missing, cut short, or changed.
+    """
+    try:
+        # Opened here: `np.load` leaves a file that it cannot read open.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except DAMAGE as error:
+        raise ResultsError(f"{path} is damaged ({error}). {way_out}") from error

@@ -1,13 +1,13 @@
 """The folder of a run.
 
-    config-AGENT.json     effective config, which `mapek run` takes as it is
-    manifest.json         what runs, with seeds and versions
-    chunks/               finished trials, as they come; gone when the run is complete
-    episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
-    q_tables-AGENT.npz    Q-tables at the end: q_TRIAL (actions x states), actions_TRIAL (ids of the rows)
-    trace-AGENT.npy       steps of the traced episodes of trial 0
-    result.json           what the command found, with the hashes; its presence says that the run is complete
-    figures/              PNG and PDF
+config-AGENT.json     effective config, which `mapek run` takes as it is
+manifest.json         what runs, with seeds and versions
+chunks/               finished trials, as they come; gone when the run is complete
+episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
+q_tables-AGENT.npz    Q-tables at the end: q_TRIAL (actions x states), actions_TRIAL (ids of the rows)
+trace-AGENT.npy       steps of the traced episodes of trial 0
+result.json           what the command found, with the hashes; its presence says that the run is complete
+figures/              PNG and PDF
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.chunk import read_chunk, remove_parts
-from adapters.results.files import cannot_write, read_json, whole, write_json
+from adapters.results.chunk import read_arrays, read_chunk, remove_parts
+from adapters.results.files import cannot_write, read_json, read_npz, whole, write_json
 from adapters.results.table import read_episodes, write_npz
 from mape import __version__
 from mape.config import Config
@@ -87,6 +87,8 @@ class RunFolder:
             "agents": {agent: json.loads(config.to_json()) for agent, config in configs.items()},
             "versions": versions(),
         }
+        # Before anything is written there: a folder of someone else's is left as it is.
+        self._refuse_foreign()
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock = open(path / ".lock", "a")  # noqa: SIM115 - held until `close`
@@ -103,20 +105,36 @@ class RunFolder:
             self.close()
             raise
 
+    def _refuse_foreign(self) -> None:
+        if not self.path.is_dir() or (self.path / "manifest.json").exists():
+            return
+        # The manifest comes after the configs; a run that was killed before it has left no more than these.
+        first = {".lock", *(f"config-{agent}.json" for agent in self.configs)}
+        others = [p.name for p in self.path.iterdir() if p.name not in first and not p.match("*.json.*.part")]
+        if others:
+            raise ResultsError(
+                f"{self.path} is not empty ({sorted(others)[0]}) and holds no run of ours; choose another --out"
+            )
+
     def _open(self, wanted: dict[str, Any]) -> None:
         manifest = self.path / "manifest.json"
         if not manifest.exists():
-            if others := [p.name for p in self.path.iterdir() if p.name != ".lock"]:
-                raise ResultsError(
-                    f"{self.path} is not empty ({others[0]}) and holds no run of ours; choose another --out"
-                )
-            write_json(manifest, wanted)
+            self._refuse_foreign()
+            remove_parts(self.path)
             for agent in self.configs:
                 write_json(self.path / f"config-{agent}.json", wanted["agents"][agent])
+            write_json(manifest, wanted)
             return
         if (self.path / "result.json").exists():
             raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
-        there = read_json(manifest)
+        try:
+            there = read_json(manifest)
+        except ResultsError as error:
+            raise ResultsError(
+                f"{manifest} is damaged ({error.__cause__}), so the run there cannot be continued; choose another --out"
+            ) from error
+        if not isinstance(there, dict) or "format" not in there or "agents" not in there:
+            raise ResultsError(f"{manifest} is of no run of ours; choose another --out")
         if there != wanted:
             what, had, has = _first_difference(there, wanted)
             raise ResultsError(
@@ -154,14 +172,13 @@ class RunFolder:
         )
         arrays: dict[str, npt.NDArray[Any]] = {}
         for stem in stems:
-            with np.load(stem.with_suffix(".npz"), allow_pickle=False) as archive:
-                arrays.update({name: archive[name] for name in archive.files})
+            arrays.update(read_arrays(stem))
         trace = arrays.pop("trace", None)
         if trace is not None:
             with whole(self.path / f"trace-{agent}.npy") as file:
                 np.save(file, trace, allow_pickle=False)
         with whole(self.path / f"q_tables-{agent}.npz") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **arrays)
 
     def episodes(self, agent: str, *columns: str) -> dict[str, npt.NDArray[Any]]:
         """Return columns of the agent's table, each of shape (trials, episodes)."""
@@ -169,9 +186,9 @@ class RunFolder:
 
     def q_tables(self, agent: str) -> dict[int, tuple[npt.NDArray[np.float64], tuple[int, ...]]]:
         """Return values and action ids at the end of each trial."""
-        with np.load(self.path / f"q_tables-{agent}.npz", allow_pickle=False) as archive:
-            trials = sorted(int(name[2:]) for name in archive.files if name.startswith("q_"))
-            return {t: (archive[f"q_{t}"], tuple(archive[f"actions_{t}"].tolist())) for t in trials}
+        arrays = read_npz(self.path / f"q_tables-{agent}.npz", "Run the same command again.")
+        trials = sorted(int(name[2:]) for name in arrays if name.startswith("q_"))
+        return {t: (arrays[f"q_{t}"], tuple(arrays[f"actions_{t}"].tolist())) for t in trials}
 
     def trace(self, agent: str) -> npt.NDArray[np.void] | None:
         """Return the traced steps of trial 0, or None where nothing was traced."""

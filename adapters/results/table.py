@@ -25,7 +25,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.files import whole
+from adapters.results.files import DAMAGE, whole
 from mape.errors import ResultsError
 
 DTYPE = np.dtype(
@@ -83,10 +83,11 @@ def read_episodes(path: str | Path, columns: Iterable[str] = COLUMNS) -> dict[st
         The file is missing, cut short, or has no such column.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here: `np.load` leaves a file that it cannot read open.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             if missing := set(columns) - set(archive.files):
                 raise ResultsError(f"{path} has no column {sorted(missing)[0]!r}; it has {', '.join(archive.files)}")
             trials = len(np.unique(archive["trial"]))
             return {name: archive[name].reshape(trials, -1) for name in columns}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise ResultsError(f"{path} is no whole table of episodes: {error}. Run the same command again.") from error

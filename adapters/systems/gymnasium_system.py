@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import Any
 
 import gymnasium
@@ -37,16 +38,22 @@ def make_env(config: SystemConfig) -> gymnasium.Env[Any, Any]:
     """
     register_envs()
     try:
-        # Gymnasium's passive checker warns on every reset that an unusual environment makes; `mapek check` does it once.
+        # Gymnasium's passive checker would cost every step, and warn at every reset; `mapek check` looks once.
         return gymnasium.make(config.id, disable_env_checker=True, **config.options)
     except gymnasium.error.NameNotFound:
-        raise UnknownName(
-            "system", config.id, gymnasium.registry, "Any registered Gymnasium id serves; see `mapek list`."
-        ) from None
+        from adapters.systems import SYSTEMS
+
+        # Of the many ids that Gymnasium knows, those with an example and those that may have been meant.
+        known = {*SYSTEMS, *difflib.get_close_matches(config.id, gymnasium.registry, n=3)}
+        raise UnknownName("system", config.id, known, "Any other registered Gymnasium id serves too.") from None
     except gymnasium.error.Error as error:
         raise ConfigError(f"system {config.id!r}: {error}") from None
     except ModuleNotFoundError as error:
-        raise ConfigError(f"system {config.id!r} needs the module {error.name!r}, which is not installed") from error
+        # Where the id is "module:Id", Gymnasium raises another error than the import did.
+        name = getattr(error.__cause__, "name", None) or error.name
+        raise ConfigError(
+            f"system {config.id!r} needs the module {name!r}, which is neither installed nor in this folder"
+        ) from error
     except Exception as error:
         raise ConfigError(f"system {config.id!r} with options {config.options}: {error}") from error
 
@@ -80,7 +87,9 @@ class GymnasiumSystem:
                 f"{self.name} has no step cap of its own, and an episode must end; set system.max_steps, such as 200"
             )
         self.max_steps = int(min(caps))
-        self.signal_names: tuple[str, ...] = tuple(getattr(rules, "signal_names", getattr(self._base, "signal_names", ())))
+        self.signal_names: tuple[str, ...] = tuple(
+            getattr(rules, "signal_names", getattr(self._base, "signal_names", ()))
+        )
         self.drifts: tuple[int, ...] = tuple(getattr(rules, "drifts", getattr(self._base, "drifts", ())))
         self.draws: tuple[int, int] = (rules.reset_draws, rules.step_draws) if rules is not None else (0, 0)
         self._block = getattr(rules, "episode_draws", 0)
@@ -145,7 +154,9 @@ class GymnasiumSystem:
             The environment has no reserve, or not these.
         """
         if not hasattr(self._base, "enable_actions"):
-            raise ValueError(f"{self.name} has no actions in reserve (no enable_actions), so {actions} cannot be enabled")
+            raise ValueError(
+                f"{self.name} has no actions in reserve (no enable_actions), so {actions} cannot be enabled"
+            )
         self._base.enable_actions(actions)
         self._windows = None
 

@@ -22,8 +22,8 @@ def refused(
         )
     if status == episode.OVERFLOW:
         return NonFiniteError(
-            f"the return of episode {number} became {first}, its mean absolute TD error {action}, its largest change of "
-            f"Q {last}: too large for a float. {kept} Scale the rewards down."
+            f"the return of episode {number} became {first}, its mean absolute TD error {action}, its largest "
+            f"change of Q {last}: too large for a float. {kept} Scale the rewards down."
         )
     if isfinite(first):
         return NonFiniteError(

@@ -87,6 +87,15 @@ class Corridor:
         pass
 
 
+class Standing(Corridor):
+    """Never leaves its state; rewards are high, then low, so that its values rise and fall within an episode."""
+
+    def step(self, action, context):
+        self._step += 1
+        spoilt = self._spoil(self._number, self._step)
+        return 2, spoilt.get("reward", 50.0 if self._step <= 6 else -50.0), False, False
+
+
 def corridor_loop(corridor=None, **over):
     table = {"name": "corridor", "episodes": 10, "system": {"id": "corridor"}, "plan": {"name": "morphin"}}
     return Loop(from_table(merge(table, over)), Corridor() if corridor is None else corridor)

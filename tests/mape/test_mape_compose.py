@@ -33,7 +33,11 @@ def fresh_process(folder, text, **environment):
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(text)],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(folder), **environment},
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]),
+            **environment,
+        },
         capture_output=True,
         text=True,
         check=False,

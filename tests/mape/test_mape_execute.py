@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mape_runs import GRID, TRAFFIC, Corridor, config, corridor_loop, hashes, loop_of
+from mape_runs import GRID, TRAFFIC, Corridor, Standing, config, corridor_loop, hashes, loop_of
 
 from knowledge import ChangePlan, Knowledge, Log, QTable, RowLayout
 from mape.config import PartSpec
@@ -54,6 +54,14 @@ def test_a_system_that_raises_leaves_the_q_table_as_before_the_episode():
     before = hashes(after(3))
     loop = after(3, Corridor(spoil=failing(ZeroDivisionError("oh"), 4, 2)))
     with pytest.raises(ManagedSystemError, match="corridor raised ZeroDivisionError: oh, in episode 4 at step 2"):
+        loop.run(1)
+    assert hashes(loop) == before
+
+
+def test_values_that_an_episode_wrote_many_times_are_as_before_it_when_it_fails():
+    before = hashes(after(3, Standing()))
+    loop = after(3, Standing(spoil=once(4, 11, reward=math.nan)))
+    with pytest.raises(NonFiniteError, match="in episode 4 at step 11"):
         loop.run(1)
     assert hashes(loop) == before
 
