@@ -51,10 +51,29 @@ class DetectorSpec(PartSpec):
     signal: str = "return"
 
 
+class LearnerSpec(PartSpec):
+    """A learner."""
+
+    name: str = Field("q_learning", min_length=1)
+
+
+class AnalyzerSpec(PartSpec):
+    """An analyzer."""
+
+    name: str = Field("changes", min_length=1)
+
+
+class ScheduleSpec(PartSpec):
+    """An exploration schedule."""
+
+    name: str = Field("exponential", min_length=1)
+
+
 class PlannerSpec(PartSpec):
     """A planner and its exploration schedule."""
 
-    schedule: PartSpec = Field(default_factory=lambda: PartSpec(name="exponential"))
+    name: str = Field("morphin", min_length=1)
+    schedule: ScheduleSpec = ScheduleSpec()
 
 
 class BoxGrid(PartConfig):
@@ -121,10 +140,10 @@ class Config(PartConfig):
     trials: int = Field(1, ge=1, le=10_000_000, description="independent repetitions")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="root of all randomness")
     system: SystemConfig
-    learner: PartSpec = Field(default_factory=lambda: PartSpec(name="q_learning"))
+    learner: LearnerSpec = LearnerSpec()
     monitor: MonitorConfig = MonitorConfig()
-    analyze: PartSpec = Field(default_factory=lambda: PartSpec(name="changes"))
-    plan: PlannerSpec = Field(default_factory=lambda: PlannerSpec(name="morphin"))
+    analyze: AnalyzerSpec = AnalyzerSpec()
+    plan: PlannerSpec = PlannerSpec()
     execute: ExecuteConfig = ExecuteConfig()
 
     def to_json(self) -> str:

@@ -1,5 +1,6 @@
 """What all tests share: Hypothesis' profile, and a cache of compiled code that is not the user's."""
 
+import importlib
 import os
 import sys
 import tempfile
@@ -7,8 +8,16 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, settings
 
-# pytest imports test modules without a path to their neighbours, such as `mape_runs`.
-sys.path += [str(Path(__file__).parent / folder) for folder in ("knowledge", "mape")]
+# pytest puts this folder on the path, where the folders `knowledge` and `mape` would be taken for the packages; the
+# modules that stand beside the tests, such as `mape_runs`, are found whatever the import mode.
+_HERE = Path(__file__).parent
+sys.path[:] = [entry for entry in sys.path if Path(entry) != _HERE]
+sys.path += [str(_HERE / folder) for folder in ("knowledge", "mape")]
+for _package in ("knowledge", "managed_systems", "mape"):
+    importlib.import_module(_package)
+
+# Each folder has a conftest.py, none of which --doctest-modules can import under the others' name.
+collect_ignore_glob = ["conftest.py", "*/conftest.py"]
 
 # One folder for all runs and workers: compiling the episode takes seconds, and its name holds a hash of the sources.
 _CACHE = Path(tempfile.gettempdir(), f"mapek-test-cache-{os.getuid()}")

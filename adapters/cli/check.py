@@ -21,21 +21,13 @@ _MEMBERS = {
     "schedule": ("advance", "reset"),
     "learner": ("value", "step_size"),
 }
-_CHECKS: dict[str, Callable[[Callable[[], Any]], list[Finding]]] = {
-    "detector": testing.check_detector,
-    "analyzer": testing.check_analyzer,
-    "planner": testing.check_planner,
-    "schedule": testing.check_schedule,
-    "learner": testing.check_learner,
-    "system": testing.check_system,
-}
 
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command; exit code 1 where a clause is broken."""
     prepare()
     kind = chosen.kind or _kind_of(chosen.name)
-    findings = _system(chosen.name) if kind == "system" else _CHECKS[kind](_maker(kind, chosen.name))
+    findings = _system(chosen.name) if kind == "system" else testing.CHECKS[kind](_maker(kind, chosen.name))
     print(f"{kind} {chosen.name}")
     for finding in findings:
         print(f"  {finding}")

@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from mape_runs import GRID, config, hashes, loop_of
 from mape.compose import Composed, specialise
 from mape.errors import ConfigError
 from mape.execute.rules import alpha_star, expected_value, max_value
-from mape.testing import _probe
+from mape.testing.learners import probe
 
 HELPER = "def half(x):\n    return x / 2.0\n"
 RULE = "import math\nfrom a_helper import half\n\n\ndef rule(x):\n    return math.exp(half(x))\n"
@@ -52,7 +53,7 @@ def test_a_second_process_compiles_nothing_and_an_edited_rule_is_compiled_anew(t
     cache = tmp_path / "cache"
 
     def run():
-        value, events = eval(fresh_process(tmp_path, RUN, MAPEK_CACHE=str(cache), PYTHONDONTWRITEBYTECODE="1"))
+        value, events = json.loads(fresh_process(tmp_path, RUN, MAPEK_CACHE=str(cache), PYTHONDONTWRITEBYTECODE="1"))
         return value, events > 0
 
     def written():
@@ -94,8 +95,7 @@ def test_a_second_process_runs_whole_episodes_without_compiling(tmp_path):
 
 @pytest.mark.parametrize("value", [max_value, expected_value])
 def test_plain_and_compiled_give_the_same_bits(value):
-    rng = np.random.default_rng(7)
-    composed = Composed(_probe, {"value": value, "step_size": alpha_star})
+    composed = Composed(probe, {"value": value, "step_size": alpha_star})
 
     def inputs():
         rng = np.random.default_rng(7)
@@ -109,7 +109,6 @@ def test_plain_and_compiled_give_the_same_bits(value):
     assert plain[6].tobytes() == compiled[6].tobytes()
     assert plain[7].tobytes() == compiled[7].tobytes()
     assert len(set(plain[7].tolist())) > 400
-    assert rng is not None
 
 
 def outer():
@@ -123,10 +122,8 @@ def plus_one(x):
     return rule(x) + 1  # noqa: F821
 
 
-@pytest.mark.parametrize("rule", [outer(), lambda x: x, outer], ids=["inner", "lambda", "calls a closure"])
+@pytest.mark.parametrize("rule", [outer(), lambda x: x, abs], ids=["inner", "lambda", "built in"])
 def test_plain_python_takes_any_rule(rule):
-    if rule is outer:
-        rule = outer()
     assert Composed(plus_one, {"rule": rule}).python()(2) == 3
 
 

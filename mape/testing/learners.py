@@ -1,0 +1,97 @@
+"""The contract of a learner."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mape.compose import Composed, specialise
+from mape.execute.rules import Floats, Ints
+from mape.ports import Learner
+from mape.testing.clauses import (
+    Broken,
+    Finding,
+    finite,
+    judge,
+)
+
+# Bound by `mape.compose`.
+value: Any = None
+step_size: Any = None
+
+
+def probe(
+    q: Floats, rows: Ints, states: Ints, epsilon: float, td_errors: Floats, rates: Floats, values: Floats, sizes: Floats
+) -> int:
+    """Call a learner's rules on many inputs: a template, see `mape.compose`."""
+    for i in range(len(states)):
+        values[i] = value(q, rows, 1 + i % len(rows), int(states[i]), epsilon)
+        sizes[i] = step_size(td_errors[i], rates[i])
+    return len(states)
+
+
+def check_learner(make: Callable[[], Learner]) -> list[Finding]:
+    """Check a learner's constants and rules, the latter both in plain Python and compiled."""
+
+    def inputs(learner: Learner) -> tuple[Any, ...]:
+        rng = np.random.default_rng(1989)
+        td_errors = np.concatenate([[0.0, 1.0, -1.0, 100.0, -745.0, 1e6], rng.normal(0.0, 30.0, 194)])
+        q, rates = rng.normal(0.0, 50.0, (5, 12)), np.sort(rng.random((200, len(learner.rate_names))))
+        states = rng.integers(0, 12, 200)
+        return (q, np.array([4, 0, 2, 1]), states, 0.3, td_errors, rates, np.empty(200), np.empty(200))
+
+    def bound(learner: Learner) -> Composed:
+        return Composed(probe, {"value": learner.value, "step_size": learner.step_size})
+
+    def constants() -> None:
+        learner = make()
+        names = learner.rate_names
+        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names) or not names:
+            raise Broken(f"rate_names is {names!r}; give a tuple of the names of the learning-rate parameters")
+        if not finite(learner.discount) or not 0.0 <= learner.discount <= 1.0:
+            raise Broken(f"discount is {learner.discount!r}; it is a number in [0, 1]")
+        if not isinstance(learner.bootstrap_terminal, bool):
+            raise Broken(f"bootstrap_terminal is {learner.bootstrap_terminal!r}; it is True or False")
+
+    def pure() -> None:
+        learner = make()
+        given, again = inputs(learner), inputs(learner)
+        rule = np.errstate(all="ignore")(bound(learner).python())
+        rule(*given)
+        for name, before, after in zip(("q", "rows", "states"), again, given, strict=False):
+            if not np.array_equal(before, after):
+                raise Broken(f"a rule wrote into {name}; rules only read what they are given")
+        if not np.array_equal(again[5], given[5]):
+            raise Broken("step_size wrote into rate; rules only read what they are given")
+        for name, results in (("value", given[6]), ("step_size", given[7])):
+            if not np.isfinite(results).all():
+                at = int(np.flatnonzero(~np.isfinite(results))[0])
+                raise Broken(f"{name} gave {results[at]} for TD error {given[4][at]}, rate {given[5][at]}; stay finite")
+        rule(*again)
+        if not (np.array_equal(given[6], again[6]) and np.array_equal(given[7], again[7])):
+            raise Broken("the same numbers gave two results; rules keep nothing and draw nothing")
+
+    def same_bits() -> None:
+        learner = make()
+        plain, compiled = inputs(learner), inputs(learner)
+        np.errstate(all="ignore")(bound(learner).python())(*plain)
+        specialise(bound(learner).compiled(), compiled)(*compiled)
+        for name, at in (("value", 6), ("step_size", 7)):
+            if (differ := np.flatnonzero(plain[at] != compiled[at])).size:
+                i = int(differ[0])
+                raise Broken(
+                    f"{name} gives {plain[at][i]} in Python and {compiled[at][i]} compiled; use math, not numpy, "
+                    "for functions of numbers, floats where integers would overflow, and no order that may change"
+                )
+
+    return judge(
+        make,
+        "rate_names discount bootstrap_terminal value() step_size()",
+        [
+            ("names its learning-rate parameters, a discount and bootstrap_terminal", constants),
+            ("has pure rules with finite results", pure),
+            ("gives the same bits compiled as in plain Python", same_bits),
+        ],
+    )

@@ -1,0 +1,244 @@
+"""The contract of a managed system."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from knowledge import (
+    ChangePlan,
+    Knowledge,
+    Log,
+    RowLayout,
+)
+from mape import registry
+from mape.config import PartSpec
+from mape.execute.component import SIGNALS, Execute
+from mape.ports import Episode, ManagedSystem
+from mape.testing.clauses import (
+    Broken,
+    Finding,
+    Noted,
+    finite,
+    judge,
+    plain_json,
+)
+
+
+class _Moment(NamedTuple):
+    """What a step looks like from outside, all of it comparable bit for bit."""
+
+    action: int
+    state: int
+    reward: float
+    ended: bool
+    explorable: tuple[bool, ...]
+    signals: tuple[float, ...]
+
+
+EPISODES = 5
+"""Episodes that a managed system is put through, each of at most `LONGEST` steps."""
+LONGEST = 200
+
+
+def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
+    """Check a managed system by random episodes; one with rules is learnt compiled and by calls, too.
+
+    Whether its environment keeps to Gymnasium's own contract is a question for `gymnasium.utils.env_checker`.
+    """
+    made: list[Any] = []
+
+    def fresh() -> ManagedSystem:
+        made.append(make())
+        return made[-1]  # type: ignore[no-any-return]
+
+    def described() -> None:
+        system = fresh()
+        whole = {"n_states": (system.n_states, 1), "max_steps": (system.max_steps, 1)}
+        whole |= {f"draws[{i}]": (draws, 0) for i, draws in enumerate(system.draws)}
+        for name, (number, least) in whole.items():
+            if type(number) is not int or number < least:
+                raise Broken(f"{name} is {number!r}; give an int of at least {least}")
+        names = system.signal_names
+        if not isinstance(names, tuple) or len({*names, *SIGNALS}) != len(names) + len(SIGNALS):
+            raise Broken(f"signal_names is {names!r}; give a tuple of distinct names, none of {', '.join(SIGNALS)}")
+        if list(system.drifts) != sorted({*system.drifts}):
+            raise Broken(f"drifts is {system.drifts!r}; give increasing episodes")
+
+    def plays() -> None:
+        system = fresh()
+        for number in range(1, EPISODES + 1):
+            _play(system, number)
+
+    def foretells() -> None:
+        system = fresh()
+        for number in range(1, EPISODES + 1):
+            told = system.available(number)
+            _, found = system.begin(_episode(system, number))
+            if told is not None and {*told} != {*found}:
+                raise Broken(f"available({number}) is {told}, and episode {number} offers {found}; or return None")
+
+    def deterministic() -> None:
+        first, second = fresh(), fresh()
+        for number in range(1, EPISODES + 1):
+            _compare(_play(first, number), _play(second, number), f"episode {number} of two fresh ones")
+
+    def redriven() -> None:
+        system, other = fresh(), fresh()
+        played = {}
+        for number in range(1, EPISODES + 1):
+            carried = _carried(system)
+            played[number] = (carried, _play(system, number))
+        for number in (EPISODES, 1, 3, 3):
+            carried, moments = played[number]
+            if carried is not None:
+                _carried(other, carried)
+            try:
+                _compare(moments, _play(other, number), f"episode {number}, driven again after others")
+            except Broken as broken:
+                if carried is not None:
+                    raise Broken(
+                        f"{broken}, although its state was set; get_state() holds all that it carries"
+                    ) from None
+                raise Noted(
+                    f"not resumable: {broken}. Take all randomness from the episode's seed or uniforms, and the "
+                    "episode's number from the reset; or offer get_state() and set_state()"
+                ) from None
+
+    def by_rules() -> None:
+        system, other = fresh(), fresh()
+        if system.rules is None:
+            raise Noted("offers no rules, so that its episodes are called step by step and not compiled")
+        for number in range(1, EPISODES + 1):
+            _compare(_play(system, number), _play_by_rules(other, number), f"episode {number}, by step() and by rules")
+
+    def compiled() -> None:
+        if fresh().rules is None:
+            raise Noted("offers no rules")
+        called, ran = (_learn(fresh(), engine) for engine in ("python", "compiled"))
+        for number, (one, other) in enumerate(zip(called, ran, strict=True), 1):
+            if one != other:
+                raise Broken(
+                    f"episode {number} learns {one} by calls and {other} compiled; use math, not numpy, for functions "
+                    "of numbers, and floats where integers would overflow"
+                )
+
+    findings = judge(
+        fresh,
+        "name n_states max_steps signal_names drifts draws rules "
+        "available() begin() step() explorable() enable() close()",
+        [
+            ("describes itself in numbers", described),
+            ("stays within its states, with finite rewards and known actions", plays),
+            ("says beforehand which actions an episode offers, or nothing", foretells),
+            ("is deterministic: two fresh ones play the same episodes", deterministic),
+            ("plays an episode the same whatever was played before", redriven),
+            ("has rules that equal its steps, bit for bit", by_rules),
+            ("learns the same Q-table compiled and called", compiled),
+        ],
+    )
+    for system in made:
+        if hasattr(system, "close"):
+            system.close()
+    return findings
+
+
+def _episode(system: ManagedSystem, number: int) -> Episode:
+    generator = np.random.default_rng((1713, number))
+    width = system.draws[0] + system.max_steps * system.draws[1]
+    return Episode(number, int(generator.integers(2**32)), generator.random(width))
+
+
+def _carried(system: ManagedSystem, state: Any = None) -> Any:
+    """Return what a system says that it carries between episodes, or set it; None where it says nothing."""
+    optional: Any = system
+    if not hasattr(system, "get_state"):
+        return None
+    if state is not None:
+        optional.set_state(json.loads(state))
+    return plain_json(optional.get_state())
+
+
+def _play(system: ManagedSystem, number: int) -> list[_Moment]:
+    state, available = system.begin(_episode(system, number))
+    if not available or len({*available}) != len(available) or any(type(a) is not int or a < 0 for a in available):
+        raise Broken(f"episode {number} offers {available!r}; give at least one action, distinct ints from 0")
+    _in_range(system, state, f"begin() of episode {number}")
+    moments = [_Moment(-1, state, 0.0, False, tuple(bool(system.explorable(a)) for a in available), ())]
+    rng = random.Random(number)
+    context = np.zeros(len(system.signal_names))
+    for step in range(1, min(system.max_steps, LONGEST) + 1):
+        action = rng.choice(available)
+        context[:] = 0.0
+        state, reward, terminated, truncated = system.step(action, context)
+        where = f"step({action}) in episode {number}"
+        _in_range(system, state, where)
+        if not finite(reward):
+            raise Broken(f"{where} gave reward {reward!r}; rewards are finite numbers")
+        if type(terminated) is not bool or type(truncated) is not bool:
+            raise Broken(f"{where} gave terminated {terminated!r}, truncated {truncated!r}; give bools")
+        if not np.isfinite(context).all():
+            raise Broken(f"{where} gave signals {dict(zip(system.signal_names, context.tolist(), strict=True))}")
+        ended = terminated or truncated or step == system.max_steps
+        marks = () if ended else tuple(bool(system.explorable(a)) for a in available)
+        moments.append(_Moment(action, state, float(reward), ended, marks, tuple(context.tolist())))
+        if ended:
+            break
+    return moments
+
+
+def _in_range(system: ManagedSystem, state: Any, where: str) -> None:
+    if type(state) is not int or not 0 <= state < system.n_states:
+        raise Broken(f"{where} went to state {state!r}; states are ints from 0 to {system.n_states - 1}")
+
+
+def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
+    rules, draws = system.rules, _episode(system, number).uniforms
+    assert rules is not None
+    if (rules.reset_draws, rules.step_draws) != system.draws:
+        raise Broken(f"rules take {(rules.reset_draws, rules.step_draws)} uniforms, draws says {system.draws}")
+    windows = rules.windows.tolist()
+    available = tuple(action for action, (first, last) in enumerate(windows) if first <= number <= last)
+    phase = rules.phase(rules.params, number)
+    state = rules.reset(rules.params, phase, draws, 0)
+
+    def marks() -> tuple[bool, ...]:
+        return tuple(bool(rules.explorable(rules.params, phase, state, action)) for action in available)
+
+    moments = [_Moment(-1, state, 0.0, False, marks(), ())]
+    rng = random.Random(number)
+    context = np.zeros(len(system.signal_names))
+    for step in range(min(system.max_steps, LONGEST)):
+        action = rng.choice(available)
+        context[:] = 0.0
+        at = rules.reset_draws + step * rules.step_draws
+        state, reward, terminated = rules.step(rules.params, phase, state, action, draws, at, context)
+        ended = bool(terminated) or step + 1 == system.max_steps
+        moments.append(_Moment(action, state, float(reward), ended, () if ended else marks(), tuple(context.tolist())))
+        if ended:
+            break
+    return moments
+
+
+def _compare(one: list[_Moment], other: list[_Moment], where: str) -> None:
+    for step, (first, second) in enumerate(zip(one, other, strict=False)):
+        if first != second:
+            raise Broken(f"{where} differs at step {step}: {first} and {second}")
+    if len(one) != len(other):
+        raise Broken(f"{where} has {len(one) - 1} and {len(other) - 1} steps")
+
+
+def _learn(system: ManagedSystem, engine: str) -> list[Any]:
+    """Return the observations of a few episodes and, last, the hash of the Q-table."""
+    learnt: list[Any] = []
+    knowledge = Knowledge(Log(RowLayout(SIGNALS + system.signal_names, 0, 3, 4096)))
+    learner = registry.build("learner", PartSpec(name="q_learning"))
+    execute = Execute(system, learner, knowledge, learnt.append, engine=engine, max_actions=4096)
+    execute.adopt(ChangePlan(0, 0, 0.5, (0.1, 0.9, 5.0), (), (), (), False, None))
+    for _ in range(EPISODES):
+        execute.drive()
+    return [*learnt, execute.q_table.sha256()]
