@@ -59,8 +59,8 @@ def check_name(agent: str) -> None:
     """Refuse an agent whose name cannot be part of a file's name."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", agent):
         raise ConfigError(
-            f"agent {agent!r} gives its name to files; let it begin with a letter or digit, of at most 64 letters, digits, "
-            "_ . or -"
+            f"agent {agent!r} gives its name to files; let it begin with a letter or digit, and hold at most 64 "
+            "letters, digits, _ . or -"
         )
 
 

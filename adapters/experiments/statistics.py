@@ -48,6 +48,7 @@ class Comparison(NamedTuple):
     p: float | None
 
 
+@np.errstate(all="ignore")  # what is too large for a float becomes infinite, and null in JSON
 def summary(values: Floats) -> Summary:
     """Summarise one sample."""
     values = np.asarray(values, dtype=np.float64)
@@ -59,6 +60,7 @@ def summary(values: Floats) -> Summary:
     return Summary(mean, sd, len(values), _interval(np.mean, values))
 
 
+@np.errstate(all="ignore")
 def compare(first: Floats, second: Floats) -> Comparison:
     """Compare two samples of independent trials."""
     from scipy import stats

@@ -45,8 +45,8 @@ def whole(path: Path) -> Iterator[IO[bytes]]:
 
 
 GO_ON = (
-    "What was finished before is kept; make room or choose another place, and give the same command with the same --out "
-    "to go on."
+    "What was finished before is kept; make room or choose another place, and give the same command with the same "
+    "--out to go on."
 )
 
 

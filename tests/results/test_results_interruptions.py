@@ -1,0 +1,236 @@
+"""A run that is killed, interrupted or crowded out leaves what is finished, and goes on from there."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from real_runs import (
+    MANY,
+    children_of,
+    contents,
+    finished_chunks,
+    leftovers,
+    little_room,
+    result_of,
+    run,
+    running,
+    wait_for_a_chunk,
+    wait_until_gone,
+)
+
+from adapters.cli.main import main
+from adapters.results import COLUMNS, read_episodes
+from adapters.results.chunk import read_arrays, read_chunk
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that nothing happened to."""
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    assert main([*MANY, "--workers", "1", "--out", str(out)]) == 0
+    return out
+
+
+def continue_in(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    """Give the command again, in this process and with one worker: neither may make a difference."""
+    monkeypatch.chdir(folder)
+    capsys.readouterr()
+    assert main([*MANY, "--workers", "1", "--out", "out"]) == 0
+    return capsys.readouterr().out
+
+
+def assert_equal_runs(found: Path, expected: Path) -> None:
+    assert result_of(found) == result_of(expected)
+    table, other = (read_episodes(folder / "episodes-frozen_lake.npz") for folder in (found, expected))
+    for column in COLUMNS:
+        np.testing.assert_array_equal(table[column], other[column], err_msg=column)
+    tables, others = (dict(np.load(folder / "q_tables-frozen_lake.npz")) for folder in (found, expected))
+    assert sorted(tables) == sorted(others)
+    for name, values in tables.items():
+        np.testing.assert_array_equal(values, others[name], err_msg=name)
+    assert sorted(contents(found)) == sorted(contents(expected))
+
+
+def test_a_killed_run_is_continued_by_the_same_command_and_comes_to_the_same(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    with running(*MANY, "--out", "out", cwd=tmp_path) as process:
+        wait_for_a_chunk(process, out)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    kept = len(finished_chunks(out))
+    assert not (out / "result.json").exists()
+
+    said = continue_in(tmp_path, monkeypatch, capsys)
+
+    assert said.startswith(f"continuing in out: {kept} trials are finished already\n")
+    assert_equal_runs(out, undisturbed)
+    assert leftovers(out) == []
+
+
+def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
+    with running(*MANY, "--out", "out", cwd=tmp_path) as process:
+        wait_for_a_chunk(process, tmp_path / "out")
+        children = children_of(process.pid)
+        assert len(children) >= 2
+        process.kill()
+        process.wait()
+        wait_until_gone(children)
+
+
+def test_ctrl_c_ends_with_130_names_the_folder_and_how_to_go_on_and_keeps_what_is_finished(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    with running(*MANY, "--out", "out", cwd=tmp_path) as process:
+        wait_for_a_chunk(process, out)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to parent and workers
+        said, complaint = process.communicate()
+
+    assert process.returncode == 130, complaint
+    kept = len(finished_chunks(out))
+    assert complaint == (
+        f"mapek: stopped. {kept} of 16 trials are finished and kept in out; "
+        "the same command with --out out continues.\n"
+    )
+    assert said == ""
+    assert kept >= 1
+    assert leftovers(out) == []
+    assert not (out / "result.json").exists()
+    assert f"continuing in out: {kept} trials" in continue_in(tmp_path, monkeypatch, capsys)
+    assert_equal_runs(out, undisturbed)
+
+
+def test_sigterm_leaves_nothing_half_written_under_a_final_name(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with running(*MANY, "--out", "out", cwd=tmp_path) as process:
+        wait_for_a_chunk(process, out)
+        children = children_of(process.pid)
+        process.terminate()
+        process.wait()
+        wait_until_gone(children)
+
+    assert process.returncode == -signal.SIGTERM
+    assert not list(out.glob("*.npz"))
+    assert not (out / "result.json").exists()
+    for chunk in finished_chunks(out):
+        # Each says how long its rows are, and what their hash is.
+        assert read_chunk(chunk.with_suffix("")) is not None
+        assert set(read_arrays(chunk.with_suffix(""))) == {f"q_{int(chunk.stem[:8])}", f"actions_{int(chunk.stem[:8])}"}
+
+
+def test_a_second_run_into_a_folder_in_use_is_refused_and_the_first_ends_well(
+    tmp_path: Path, undisturbed: Path
+) -> None:
+    out = tmp_path / "out"
+    with running(*MANY, "--out", "out", cwd=tmp_path) as first:
+        wait_for_a_chunk(first, out)
+        os.killpg(first.pid, signal.SIGSTOP)  # else it might be over before the second begins
+        second = run(*MANY, "--out", "out", cwd=tmp_path, code=1)
+        os.killpg(first.pid, signal.SIGCONT)
+        said, complaint = first.communicate()
+
+    assert second.stderr == "mapek: another run is writing to out; wait for it, or choose another --out\n"
+    assert (first.returncode, complaint) == (0, "")
+    assert "results:  out" in said
+    assert_equal_runs(out, undisturbed)
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_disk_that_fills_while_trials_run_is_said_once_and_leaves_no_half_of_a_file(
+    tmp_path: Path, workers: str
+) -> None:
+    # A trial's rows are 19 kB, the manifest and configs below 2.
+    full = run(*MANY, "--workers", workers, "--out", "out", cwd=tmp_path, code=1, start=little_room(15_000))
+
+    assert full.stderr.startswith("mapek: ")
+    assert "out/chunks/frozen_lake/000000" in full.stderr
+    assert ".rows cannot be written: File too large. What was finished before is kept; make room" in full.stderr
+    assert full.stderr.count("\n") == 1
+    assert [name for name in contents(tmp_path / "out") if not name.endswith((".json", ".lock"))] == []
+    assert finished_chunks(tmp_path / "out") == []
+
+
+def test_a_disk_that_fills_when_the_tables_are_made_keeps_every_trial(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    full = run(*MANY, "--workers", "1", "--out", "out", cwd=tmp_path, code=1, start=little_room(30_000))
+
+    assert full.stderr.startswith("mapek: out/episodes-frozen_lake.npz cannot be written: File too large. ")
+    assert full.stderr.count("\n") == 1
+    assert len(finished_chunks(out)) == 16
+    assert not list(out.glob("*.npz"))
+    assert not (out / "result.json").exists()
+    assert leftovers(out) == []
+
+    assert "continuing in out: 16 trials are finished already" in continue_in(tmp_path, monkeypatch, capsys)
+    assert_equal_runs(out, undisturbed)
+
+
+SMALL = ("run", MANY[1], "--set", "episodes=20", "--no-figures", "-q")
+
+
+def test_json_onto_a_full_device_is_said_and_the_folder_is_complete(tmp_path: Path) -> None:
+    full = run(*SMALL, "--out", "out", "--json", "/dev/full", cwd=tmp_path, code=1)
+
+    assert full.stderr == (
+        "mapek: /dev/full cannot be written: No space left on device. The run is complete; all of it is in out.\n"
+    )
+    assert result_of(tmp_path / "out")["passes"] == 20
+
+
+def test_json_that_does_not_fit_leaves_the_earlier_file(tmp_path: Path) -> None:
+    (tmp_path / "found.json").write_text("earlier")
+    # The result is 5 kB long for 20 trials, and so is the one in the folder: nothing of the two may be there by half.
+    full = run(
+        *SMALL, "--trials", "20", "--out", "out", "--json", "found.json", cwd=tmp_path, code=1, start=little_room(4_000)
+    )
+
+    assert "cannot be written: File too large" in full.stderr
+    assert "Traceback" not in full.stderr
+    assert (tmp_path / "found.json").read_text() == "earlier"
+    assert not (tmp_path / "out" / "result.json").exists()
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize("command", [(*SMALL, "--out", "out", "--json", "-"), ("list",)], ids=["run", "list"])
+def test_standard_output_that_is_full_is_said(tmp_path: Path, command: tuple[str, ...]) -> None:
+    start = ("bash", "-c", f'exec {sys.executable} -m mape "$@" > /dev/full', "bash")
+    full = run(*command, cwd=tmp_path, code=1, start=start)
+
+    assert full.stderr.splitlines()[-1] == (
+        "mapek: standard output cannot be written: No space left on device. Lead it to another place."
+    )
+    assert "Traceback" not in full.stderr
+    assert "Exception ignored" not in full.stderr
+    assert command == ("list",) or result_of(tmp_path / "out")["passes"] == 20
+
+
+def test_a_run_that_fails_under_way_is_continued_once_the_part_is_mended(tmp_path: Path) -> None:
+    part = tmp_path / "flaky.py"
+    text = (
+        "from mape.monitor.page_hinkley import PageHinkley\n\n"
+        "class Flaky(PageHinkley):\n"
+        "    seen = 0\n"
+        "    def update(self, x):\n"
+        "        Flaky.seen += 1\n"
+        "        assert Flaky.seen < {limit}, 'worn out'\n"
+        "        return super().update(x)\n"
+    )
+    part.write_text(text.format(limit=1000))
+    command = (
+        *MANY, "--trials", "4", "--workers", "1", "--set", 'monitor.detectors=["flaky:Flaky"]', "--out", "out",
+    )  # fmt: skip
+
+    failed = run(*command, cwd=tmp_path, code=1)
+    assert "mapek: trial 2: detector Flaky raised AssertionError: worn out, at pass 200 on return = " in failed.stderr
+    assert len(finished_chunks(tmp_path / "out")) == 2
+    assert leftovers(tmp_path / "out") == []
+
+    part.write_text(text.format(limit=10**9))
+    assert "continuing in out: 2 trials are finished already" in run(*command, cwd=tmp_path).stdout
