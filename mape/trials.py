@@ -71,8 +71,10 @@ def run_trial(
             loop.log.on_rows(on_rows)
         if prepare is not None:
             prepare(loop)
-        loop.run(config.episodes)
-        loop.log.flush()
+        try:
+            loop.run(config.episodes)
+        finally:
+            loop.log.flush()  # what is finished is heard of, whatever happened then
         return TrialResult(
             trial, loop.log.passes, steps, tuple(alarms), loop.log.sha256(), loop.execute.q_table.sha256()
         )

@@ -42,7 +42,7 @@ def _kind_of(name: str) -> str:
         raise ConfigError(f"{name!r} is a {' and a '.join(kinds)}; say which with --kind")
     if kinds:
         return kinds[0]
-    module, _, attribute = name.partition(":")
+    _, _, attribute = name.partition(":")
     if not attribute or "/" in name:
         from adapters.systems.checking import is_registered
 

@@ -40,7 +40,13 @@ def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = 
     return load(path, profile=chosen.profile or defaults.get("profile"), agent=agent, overrides=overrides)
 
 
-def open_folder(chosen: argparse.Namespace, kind: str, name: str, configs: Mapping[str, Config]) -> RunFolder:
+def open_folder(
+    chosen: argparse.Namespace,
+    kind: str,
+    name: str,
+    configs: Mapping[str, Config],
+    trace: tuple[int, int] | None = None,
+) -> RunFolder:
     """Open the folder that the command line names, or a new one, and say if it is continued.
 
     What is wrong with a config is said before: no folder is begun that could not be gone on with.
@@ -49,7 +55,7 @@ def open_folder(chosen: argparse.Namespace, kind: str, name: str, configs: Mappi
     for agent, config in configs.items():
         check_name(agent)
         check(config)
-    folder = RunFolder(Path(chosen.out) if chosen.out else default_path(name), kind, configs)
+    folder = RunFolder(Path(chosen.out) if chosen.out else default_path(name), kind, configs, trace)
     if folder.resumed:
         say(chosen, f"continuing in {folder.path}: {folder.resumed} trials are finished already")
     return folder

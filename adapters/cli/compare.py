@@ -122,10 +122,8 @@ def _print(
         interval = "" if found.interval is None else "[{:+,.0f}, {:+,.0f}]".format(*found.interval)
         g = "-" if found.hedges_g is None else f"{found.hedges_g:+.2f}"
         t = "-" if found.t is None else f"{found.t:.2f}"
-        say(
-            chosen,
-            f"{agent:<{width}}{found.difference:>+14,.0f}{interval:>28}{g:>15}{t:>10}{'-' if p is None else f'{p:.2g}':>11}",
-        )
+        corrected_p = "-" if p is None else f"{p:.2g}"
+        say(chosen, f"{agent:<{width}}{found.difference:>+14,.0f}{interval:>28}{g:>15}{t:>10}{corrected_p:>11}")
 
 
 def _with_sd(found: dict[str, Any]) -> str:

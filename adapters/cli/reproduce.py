@@ -38,7 +38,7 @@ def execute(chosen: argparse.Namespace) -> int:
     profile = chosen.profile or profile
     configs = {agent: config_of(path, chosen, agent, trials=trials, profile=profile) for agent in agents}
     traced = None if chosen.no_figures or trace is None else (1, configs[agents[0]].episodes)
-    with open_folder(chosen, f"reproduce {chosen.experiment}", chosen.experiment, configs) as folder:
+    with open_folder(chosen, f"reproduce {chosen.experiment}", chosen.experiment, configs, traced) as folder:
         results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet)
         say(chosen)
         result = {"experiment": chosen.experiment, "profile": profile, "trials": configs[agents[0]].trials}
@@ -98,15 +98,15 @@ def _table1(
     if profile == "paper":
         say(
             chosen,
-            "\nProfile paper is Algorithm 1 as printed. It does not give the paper's Table 1; the profile reference adds "
-            "the success rule of the authors' published code, and does.",
+            "\nProfile paper is Algorithm 1 as printed. It does not give the paper's Table 1; the profile reference, "
+            "which adds\nthe success rule of the authors' published code, does.",
         )
     say(
         chosen,
         "\nconverged: first episode of the stage at whose end max|change of Q| < 0.01, counted only where the stage "
-        "before\nconverged; a trial that did not converge is censored, not late. z: difference in the paper's standard "
-        "deviations\nof one trial. What the ratio does not say: it is mostly a weak baseline (see README, What is honest "
-        "to claim).",
+        "before\nconverged; a trial that did not converge is censored, not late. z: difference in the paper's "
+        "standard deviations\nof one trial. What the ratio does not say: it is mostly a weak baseline (README, What is "
+        "honest to claim).",
     )
     return {
         "agents": {
@@ -198,10 +198,8 @@ def _traffic(
             "detection": [d._asdict() for d in met],
             "detection_initial": initial,
         }
-    say(
-        chosen,
-        f"\nDetection by Page-Hinkley\n{'agent, drift at':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}",
-    )
+    say(chosen, "\nDetection by Page-Hinkley")
+    say(chosen, f"{'agent, drift at':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}")
     for agent in configs:
         if configs[agent].monitor.detectors:
             say(chosen, agent)
@@ -232,10 +230,8 @@ def _jump(
     before_at, after_at = (max(1, change - 20), change - 1), (max(1, config.episodes - 19), config.episodes)
     optimum = shortest_path(system, config.episodes)
     say(chosen, f"Jump, {config.trials:,} trials per agent; the shortest path at the end has {optimum} steps")
-    say(
-        chosen,
-        f"\n{'mean steps over episodes':<26}{'':<8}{'%d-%d' % before_at:>10}{'%d-%d' % after_at:>10}{'optimal':>10}",
-    )
+    spans = [f"{first}-{last}" for first, last in (before_at, after_at)]
+    say(chosen, f"\n{'mean steps over episodes':<26}{'':<8}{spans[0]:>10}{spans[1]:>10}{'optimal':>10}")
     found: dict[str, Any] = {}
     for agent in configs:
         steps = folder.episodes(agent, "steps")["steps"].astype(float)

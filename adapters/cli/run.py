@@ -27,7 +27,7 @@ def execute(chosen: argparse.Namespace) -> int:
         if span is not None and span[1] > config.episodes:
             raise ConfigError(f"{option} {span[0]}:{span[1]} goes beyond the run's {config.episodes} episodes")
     watch = None if chosen.show is None else _shower(chosen, *chosen.show)
-    with open_folder(chosen, "run", config.name, {label: config}) as folder:
+    with open_folder(chosen, "run", config.name, {label: config}, chosen.trace) as folder:
         results = run_agents(
             {label: config}, folder, workers=chosen.workers, trace=chosen.trace, quiet=chosen.quiet, prepare=watch
         )[label]

@@ -6,17 +6,17 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from adapters import detectors
 from adapters.results.files import read_json, read_npz, whole, write_json
-from adapters.results.table import DTYPE, from_rows
+from adapters.results.table import COLUMNS, DTYPE, from_rows
 from adapters.systems import make_system
 from mape.config import from_table
-from mape.errors import ResultsError
+from mape.errors import MapekError, ResultsError
 from mape.execute.episode import TRACE_COLUMNS
 from mape.loop import Loop
 from mape.trials import TrialResult, run_trial
@@ -49,13 +49,16 @@ def run_chunk(
     Raises
     ------
     MapekError
-        A trial failed, or the results could not be written; nothing of this chunk stays.
+        The results could not be written: nothing of this chunk stays. Or a trial failed: the trials before it are
+        stored as a chunk, and its own finished passes as ``broken-TRIAL.npz`` beside it.
     """
     detectors.register()  # a worker process knows no adapters of its own
     config = from_table(json.loads(config_json))
     results: list[TrialResult] = []
     arrays: dict[str, npt.NDArray[Any]] = {}
     digest = hashlib.sha256()
+    whole_trials = digest.copy()
+    failure: MapekError | None = None
     path = Path(stem)
     with whole(path.with_suffix(".rows")) as file:
         for trial in range(first, first + count):
@@ -77,7 +80,15 @@ def run_chunk(
                 if prepare is not None:
                     prepare(loop)
 
-            results.append(run_trial(config, trial, make_system, on_rows=keep, prepare=ready))
+            try:
+                results.append(run_trial(config, trial, make_system, on_rows=keep, prepare=ready))
+            except MapekError as error:
+                _break_off(file, len(results) * config.episodes, path.parent / f"broken-{trial}.npz")
+                if not results:
+                    raise
+                failure = error
+                break
+            whole_trials = digest.copy()
             table = kept[0].execute.q_table
             arrays[f"q_{trial}"] = table.values
             arrays[f"actions_{trial}"] = np.array(table.actions, dtype=np.int64)
@@ -87,9 +98,26 @@ def run_chunk(
         np.savez(file, allow_pickle=False, **arrays)
     write_json(
         path.with_suffix(".json"),
-        {"rows": count * config.episodes, "rows_sha256": digest.hexdigest(), "trials": [r._asdict() for r in results]},
+        {
+            "rows": len(results) * config.episodes,
+            "rows_sha256": whole_trials.hexdigest(),
+            "trials": [r._asdict() for r in results],
+        },
     )
+    if failure is not None:
+        raise failure
     return results
+
+
+def _break_off(file: IO[bytes], rows: int, target: Path) -> None:
+    """Cut the rows of a broken trial off a chunk, and store them by themselves."""
+    file.flush()
+    table = np.fromfile(file.name, DTYPE, offset=rows * DTYPE.itemsize)
+    file.truncate(rows * DTYPE.itemsize)
+    file.seek(0, 2)
+    if len(table):
+        with whole(target) as store:
+            np.savez(store, allow_pickle=False, **{name: table[name] for name in COLUMNS})
 
 
 def read_chunk(stem: Path) -> list[TrialResult] | None:

@@ -2,7 +2,8 @@
 
 config-AGENT.json     effective config, which `mapek run` takes as it is
 manifest.json         what runs, with seeds and versions
-chunks/               finished trials, as they come; gone when the run is complete
+chunks/               finished trials, as they come; gone when the run is complete. Of a trial that failed,
+                      broken-TRIAL.npz holds the passes before the failure
 episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
 q_tables-AGENT.npz    Q-tables at the end: q_TRIAL (actions x states), actions_TRIAL (ids of the rows)
 trace-AGENT.npy       steps of the traced episodes of trial 0
@@ -70,6 +71,8 @@ class RunFolder:
         The command.
     configs
         Agent -> config.
+    trace
+        Episodes of trial 0 whose steps are kept; a run that is continued has the same.
 
     Raises
     ------
@@ -77,7 +80,9 @@ class RunFolder:
         The folder holds something else, or another process works in it.
     """
 
-    def __init__(self, path: Path, kind: str, configs: Mapping[str, Config]) -> None:
+    def __init__(
+        self, path: Path, kind: str, configs: Mapping[str, Config], trace: tuple[int, int] | None = None
+    ) -> None:
         self.path = path
         self.configs = dict(configs)
         self.resumed = 0
@@ -85,6 +90,7 @@ class RunFolder:
             "format": FORMAT,
             "kind": kind,
             "agents": {agent: json.loads(config.to_json()) for agent, config in configs.items()},
+            "trace": None if trace is None else list(trace),
             "versions": versions(),
         }
         # Before anything is written there: a folder of someone else's is left as it is.

@@ -243,7 +243,7 @@ class Execute:
         except Exception as error:
             raise ManagedSystemError(
                 f"{self.system.name} raised {type(error).__name__}: {error}, at the reset of episode {number}. The "
-                f"{self.passes} passes before it are kept."
+                f"{self.passes} passes before it stand in the log."
             ) from error
         # One object as long as nothing changes: what compares by identity is cheap downstream.
         return self._available if available == self._available else available
@@ -271,7 +271,7 @@ class Execute:
                 self._roll_back()
                 raise NonFiniteError(
                     f"{self.system.name} gave {name} = {value} in episode {number}; signals are finite. Nothing of "
-                    f"that episode was learnt; the {self.passes} passes before it are kept."
+                    f"that episode was learnt; the {self.passes} passes before it stand in the log."
                 )
             signals[name] = value
 

@@ -15,7 +15,7 @@ def refused(
     """Turn a status of `episode.episode` other than OK, and the three numbers it came with, into an error."""
     first, action, last = fault
     where = f"in episode {number} at step {steps}"
-    kept = f"Nothing of that episode was learnt; the {number - 1} passes before it are kept."
+    kept = f"Nothing of that episode was learnt; the {number - 1} passes before it stand in the log."
     if status == episode.OFF_TABLE:
         return ManagedSystemError(
             f"{system.name} went to state {int(first)} {where}; its states are 0 .. {system.n_states - 1}. {kept}"

@@ -56,6 +56,11 @@ class Plan:
                 f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a "
                 "ChangePlan"
             )
+        if len(plan.learning_rate) != self._knowledge.log.layout.rates:
+            raise PartError(
+                f"planner {type(self.planner).__name__} gave the learning rate {plan.learning_rate} for pass {number}; "
+                f"the learner takes {self._knowledge.log.layout.rates} numbers"
+            )
         epsilon = plan.epsilon
         if not (isinstance(epsilon, float | int) and 0.0 <= epsilon <= 1.0):
             raise PartError(

@@ -234,3 +234,32 @@ def test_a_run_that_fails_under_way_is_continued_once_the_part_is_mended(tmp_pat
 
     part.write_text(text.format(limit=10**9))
     assert "continuing in out: 2 trials are finished already" in run(*command, cwd=tmp_path).stdout
+
+
+def test_a_trial_that_fails_leaves_the_trials_before_it_and_its_own_passes(tmp_path, monkeypatch):
+    (tmp_path / "late_fault.py").write_text(
+        "class LateFault:\n"
+        "    direction, statistic = 'down', None\n"
+        "    seen = 0\n"
+        "    def update(self, x):\n"
+        "        LateFault.seen += 1\n"
+        "        if LateFault.seen > 250: raise RuntimeError('no more')\n"
+        "        return False\n"
+        "    def reset(self): pass\n"
+        "    def state(self): return None\n"
+        "    def restore(self, state): pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    config = Path(__file__).parents[2] / "examples" / "gridworld_goals.toml"
+    line = 'monitor.detectors=["late_fault:LateFault"]'
+    code = main(
+        ["run", str(config), "--set", line, "--set", "episodes=100", "--trials", "4", "--workers", "1", "--out", "out"]
+    )
+    assert code == 1
+    chunks = tmp_path / "out" / "chunks" / "gridworld_goals"
+    finished = [trial.trial for stem in chunks.glob("*.json") for trial in read_chunk(stem.with_suffix(""))]
+    assert finished == [0, 1]
+    with np.load(chunks / "broken-2.npz") as broken:
+        assert broken["episode"].tolist() == list(range(1, 51))
+        assert set(broken["trial"].tolist()) == {2}
