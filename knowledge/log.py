@@ -104,12 +104,6 @@ class Log:
             self._finish(record)
             return _OK
         if kind is Observation:
-            names: Any = record[-1]
-            if tuple(names) != self.layout.signals:
-                raise ValueError(
-                    f"Observation {record[1]} has the signals {', '.join(names)}; those of the run are "
-                    f"{', '.join(self.layout.signals)}, in this order"
-                )
             self._open = [record]
             self._expected = Symptom
             return _OK

@@ -130,9 +130,10 @@ class Execute:
         PartError
             The plan names an action that cannot be dropped, or a table that is not remembered.
         """
-        if plan.add or plan.drop or plan.enable or plan.adopt is not None:
+        _, _, _, rate, add, drop, enable, _, adopt = plan
+        if add or drop or enable or adopt is not None:
             self._change_table(plan)
-        if self.plan is None or plan.learning_rate != self.plan.learning_rate:
+        if self.plan is None or (rate is not self.plan.learning_rate and rate != self.plan.learning_rate):
             if len(plan.learning_rate) != len(self.learner.rate_names):
                 raise PartError(
                     f"plan {plan.pass_no} has {len(plan.learning_rate)} learning-rate parameters; the learner takes "
@@ -182,8 +183,8 @@ class Execute:
                 raise
             raise ManagedSystemError(
                 f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step "
-                f"{int(self._used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes before it are "
-                "kept."
+                f"{int(self._used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes before it stand "
+                "in the log."
             ) from error
         if status != episode.OK:
             self._roll_back()

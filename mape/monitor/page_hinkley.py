@@ -36,7 +36,7 @@ def page_hinkley(
     n += 1.0
     mean += (x - mean) / n
     total += mean - x - delta
-    return n, mean, total, min(minimum, total)
+    return n, mean, total, total if total < minimum else minimum
 
 
 class PageHinkley:

@@ -26,6 +26,7 @@ class Plan:
         self.planner = planner
         self._knowledge = knowledge
         self._send = send
+        self._rate: tuple[float, ...] | None = None  # the last one seen, which is as a rule the next
 
     def start(self, loop: int) -> ChangePlan:
         """Send plan 0, which starts the run, and return it."""
@@ -56,13 +57,15 @@ class Plan:
                 f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a "
                 "ChangePlan"
             )
-        if len(plan.learning_rate) != self._knowledge.log.layout.rates:
-            raise PartError(
-                f"planner {type(self.planner).__name__} gave the learning rate {plan.learning_rate} for pass {number}; "
-                f"the learner takes {self._knowledge.log.layout.rates} numbers"
-            )
-        epsilon = plan.epsilon
-        if not (isinstance(epsilon, float | int) and 0.0 <= epsilon <= 1.0):
+        rate, epsilon = plan.learning_rate, plan.epsilon
+        if rate is not self._rate:
+            if len(rate) != self._knowledge.log.layout.rates:
+                raise PartError(
+                    f"planner {type(self.planner).__name__} gave the learning rate {rate} for pass {number}; the learner "
+                    f"takes {self._knowledge.log.layout.rates} numbers"
+                )
+            self._rate = rate
+        if not (isinstance(epsilon, (float, int)) and 0.0 <= epsilon <= 1.0):
             raise PartError(
                 f"planner {type(self.planner).__name__} gave epsilon {epsilon!r} for pass {number}; an "
                 "exploration rate is a number in [0, 1]"

@@ -1,6 +1,7 @@
 """What the loop itself costs: four components, four records, log rows and hash, without the episode."""
 
 import json
+import time
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,29 @@ def test_writing_their_records_as_json(benchmark, loop, passes):
 
     benchmark.pedantic(write, rounds=3)
     benchmark.extra_info["us per pass"] = _microseconds(benchmark, passes)
+
+
+def test_a_pass_beside_its_records_as_json_turn_by_turn(loop, passes, capsys):
+    """The machine's speed drifts; in slices of 200 passes both meet the same machine."""
+    records = [record._asdict() for record in loop.log.window[-1]]
+    seconds = {"pass": 0.0, "json": 0.0}
+    for _ in range(passes // 200 or 1):
+        begun = time.perf_counter()
+        loop.run(200)
+        between = time.perf_counter()
+        for _ in range(200):
+            for record in records:
+                json.dumps(record)
+        seconds["pass"] += between - begun
+        seconds["json"] += time.perf_counter() - between
+    passed = loop.log.passes - 1
+    with capsys.disabled():
+        if passed >= PASSES:
+            us = {name: total / passed * 1e6 for name, total in seconds.items()}
+            print(
+                f"\na pass {us['pass']:.1f} us, its records as JSON {us['json']:.1f} us: {us['pass'] / us['json']:.2f}"
+            )
+    assert all(total > 0 for total in seconds.values())
 
 
 def _microseconds(benchmark, passes):
