@@ -183,8 +183,8 @@ class Execute:
                 raise
             raise ManagedSystemError(
                 f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step "
-                f"{int(self._used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes before it stand "
-                "in the log."
+                f"{int(self._used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes before it "
+                "stand in the log."
             ) from error
         if status != episode.OK:
             self._roll_back()

@@ -46,7 +46,7 @@ class Monitor:
             A detector raised, or watches a signal that the run does not have.
         """
         loop, number, _, _, reset, _, available, known, signals = seen
-        readings = []
+        readings: tuple[Reading, ...] = ()
         for name, detector in self.detectors:
             try:
                 if reset:
@@ -60,8 +60,8 @@ class Monitor:
                     detector.reset()
             except Exception as error:
                 raise self._failed(name, detector, seen, error) from error
-            readings.append(reading)
-        self._send(_new(Symptom, (loop, number, signals, available, known, tuple(readings))))
+            readings += (reading,)
+        self._send(_new(Symptom, (loop, number, signals, available, known, readings)))
 
     @staticmethod
     def _failed(name: str, detector: Detector, seen: Observation, error: Exception) -> PartError:

@@ -57,22 +57,21 @@ class PageHinkley:
         self._delta = config.delta
         self._threshold = config.threshold
         self._n = self._mean = self._total = self._minimum = 0.0
-
-    @property
-    def statistic(self) -> float:
+        self.statistic = 0.0
         """How far the cumulative sum stands above its minimum."""
-        return self._total - self._minimum
 
     def update(self, x: float) -> bool:
         """Take one value; say whether the test alarms."""
         self._n, self._mean, self._total, self._minimum = page_hinkley(
             x, self._n, self._mean, self._total, self._minimum, self._delta
         )
-        return self._total - self._minimum > self._threshold
+        self.statistic = statistic = self._total - self._minimum
+        return statistic > self._threshold
 
     def reset(self) -> None:
         """Forget everything."""
         self._n = self._mean = self._total = self._minimum = 0.0
+        self.statistic = 0.0
 
     def state(self) -> dict[str, float]:
         """Return the four numbers of the test."""
@@ -84,3 +83,4 @@ class PageHinkley:
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError(f"state {state} of a Page-Hinkley test must be finite")
         self._n, self._mean, self._total, self._minimum = numbers
+        self.statistic = self._total - self._minimum

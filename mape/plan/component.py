@@ -61,8 +61,8 @@ class Plan:
         if rate is not self._rate:
             if len(rate) != self._knowledge.log.layout.rates:
                 raise PartError(
-                    f"planner {type(self.planner).__name__} gave the learning rate {rate} for pass {number}; the learner "
-                    f"takes {self._knowledge.log.layout.rates} numbers"
+                    f"planner {type(self.planner).__name__} gave the learning rate {rate} for pass {number}; the "
+                    f"learner takes {self._knowledge.log.layout.rates} numbers"
                 )
             self._rate = rate
         if not (isinstance(epsilon, (float, int)) and 0.0 <= epsilon <= 1.0):
