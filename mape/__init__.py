@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mape.bus import LocalBus
-    from mape.config import Config, PartConfig, load
+    from mape.config import Config, load
     from mape.errors import (
         BusError,
         ConfigError,
@@ -19,13 +19,14 @@ if TYPE_CHECKING:
         UnknownName,
     )
     from mape.loop import Loop
+    from mape.specs import PartConfig
     from mape.trials import TrialResult, run_trial
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "mape.bus": ("LocalBus",),
-    "mape.config": ("Config", "PartConfig", "load"),
+    "mape.config": ("Config", "load"),
     "mape.errors": (
         "BusError",
         "ConfigError",
@@ -37,6 +38,7 @@ _HOMES = {
         "UnknownName",
     ),
     "mape.loop": ("Loop",),
+    "mape.specs": ("PartConfig",),
     "mape.trials": ("TrialResult", "run_trial"),
 }
 

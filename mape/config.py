@@ -14,35 +14,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
+from mape import registry
 from mape.errors import ConfigError, UnknownName
+from mape.specs import PartConfig, PartSpec, explain
 
 Table = dict[str, Any]
-
-
-class PartConfig(BaseModel):
-    """Base of all options: frozen, strict, no unknown field, no NaN or infinity."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class PartSpec(BaseModel):
-    """A part by short name or ``"module:Class"``, and its options; a string alone means no options."""
-
-    model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
-
-    name: str = Field(min_length=1)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"name": value} if isinstance(value, str) else value
-
-    @property
-    def options(self) -> Table:
-        """Everything but the name."""
-        return dict(self.model_extra or {})
 
 
 class DetectorSpec(PartSpec):
@@ -103,7 +81,7 @@ class SystemConfig(PartConfig):
     """The managed system: a Gymnasium id, its keyword arguments, and how it is seen."""
 
     id: str = Field(min_length=1)
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default_factory=dict, description="keyword arguments of the environment")
     max_steps: int | None = Field(
         None, ge=1, le=1_000_000, description="longest episode; needed where the system has no cap"
     )
@@ -159,13 +137,11 @@ def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
     ConfigError
         Names each field that is wrong, its value, and what is legal.
     """
-    from mape import registry
-
     try:
         # From JSON text, where a list may stand for a tuple even in strict mode.
         config = Config.model_validate_json(json.dumps(table, default=lambda value: _refuse(value, where)))
     except ValidationError as error:
-        raise ConfigError(_explain(error, where)) from None
+        raise ConfigError(explain(error, f"{where}: ", Config)) from None
     for kind, path, spec in parts_of(config):
         registry.options_of(kind, spec, f"{where}: {path}")
     return config
@@ -288,55 +264,3 @@ def parse_override(text: str) -> Table:
 
 def _refuse(value: Any, where: str) -> Any:
     raise ConfigError(f"{where}: {value!r} is not a number, text, true or false, or a list or table of such")
-
-
-def _explain(error: ValidationError, where: str) -> str:
-    import difflib
-
-    lines = []
-    for problem in error.errors():
-        loc = ".".join(str(part) for part in problem["loc"])
-        message = problem["msg"].removeprefix("Value error, ")
-        given = problem.get("input")
-        if problem["type"] == "extra_forbidden":
-            legal = _fields_at(problem["loc"][:-1])
-            close = difflib.get_close_matches(str(problem["loc"][-1]), legal, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; legal: {', '.join(legal)}" if legal else ""
-            message = f"no such option{hint}"
-        elif problem["type"] == "missing":
-            message = "is needed and missing"
-        elif problem["type"] != "value_error":
-            message = f"{message[:1].lower()}{message[1:]}, got {'a table' if isinstance(given, dict) else repr(given)}"
-        lines.append(f"{where}: {loc}: {message}" if loc else f"{where}: {message}")
-    return "\n".join(lines)
-
-
-def _fields_at(loc: tuple[Any, ...]) -> list[str]:
-    model: Any = Config
-    for part in loc:
-        fields = getattr(model, "model_fields", {})
-        if isinstance(part, int) or part not in fields:
-            return []
-        annotation = fields[part].annotation
-        kinds = [annotation, *getattr(annotation, "__args__", ())]
-        model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-    return list(getattr(model, "model_fields", {}))
-
-
-def explain_options(error: ValidationError, where: str, legal: Iterable[str]) -> str:
-    """Turn the errors of a part's own options into sentences."""
-    import difflib
-
-    legal = list(legal)
-    lines = []
-    for problem in error.errors():
-        loc = ".".join(str(part) for part in problem["loc"])
-        message = problem["msg"].removeprefix("Value error, ")
-        if problem["type"] == "extra_forbidden":
-            close = difflib.get_close_matches(loc, legal, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
-            message = f"no such option{hint} Legal: {', '.join(legal) or 'none'}"
-        elif problem["type"] != "value_error":
-            message = f"{message[:1].lower()}{message[1:]}, got {problem.get('input')!r}"
-        lines.append(f"{where}.{loc}: {message}" if loc else f"{where}: {message}")
-    return "\n".join(lines)

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
-from mape.config import PartSpec, explain_options
 from mape.errors import ConfigError, UnknownName
+from mape.specs import PartSpec, explain
 
 
 class Entry(NamedTuple):
@@ -114,7 +114,7 @@ def options_of(kind: str, spec: PartSpec, where: str) -> tuple[Any, Any]:
         try:
             return part, model.model_validate_json(json.dumps(spec.options))
         except ValidationError as error:
-            raise ConfigError(explain_options(error, where, model.model_fields)) from None
+            raise ConfigError(explain(error, f"{where}.", model)) from None
     return part, spec.options
 
 

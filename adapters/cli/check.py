@@ -9,8 +9,9 @@ from typing import Any
 
 from adapters.cli.common import prepare
 from mape import registry, testing
-from mape.config import PartSpec, SystemConfig
+from mape.config import SystemConfig
 from mape.errors import ConfigError, UnknownName
+from mape.specs import PartSpec
 from mape.testing import Finding
 
 # The members by which a class of one's own is told; the first kind that has them all.

@@ -18,8 +18,8 @@ from typing import Any
 from pydantic import Field, ValidationInfo, field_validator
 
 from knowledge.records import Direction
-from mape.config import PartConfig
 from mape.errors import ConfigError, UnknownName
+from mape.specs import PartConfig
 
 STATISTICS = {"ADWIN": "estimation", "KSWIN": "p_value"}
 """Public attributes of River's that say what the test sees now; its other detectors expose none."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from knowledge import ChangeRequest, Drift, Symptom
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 _new = tuple.__new__
 

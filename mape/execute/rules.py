@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

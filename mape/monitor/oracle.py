@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import field_validator
 
 from knowledge.records import Direction
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 
 class OracleConfig(PartConfig):

@@ -19,7 +19,7 @@ from typing import Any
 from pydantic import Field
 
 from knowledge.records import Direction
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 
 class PageHinkleyConfig(PartConfig):
@@ -57,21 +57,22 @@ class PageHinkley:
         self._delta = config.delta
         self._threshold = config.threshold
         self._n = self._mean = self._total = self._minimum = 0.0
-        self.statistic = 0.0
+
+    @property
+    def statistic(self) -> float:
         """How far the cumulative sum stands above its minimum."""
+        return self._total - self._minimum
 
     def update(self, x: float) -> bool:
         """Take one value; say whether the test alarms."""
         self._n, self._mean, self._total, self._minimum = page_hinkley(
             x, self._n, self._mean, self._total, self._minimum, self._delta
         )
-        self.statistic = statistic = self._total - self._minimum
-        return statistic > self._threshold
+        return self._total - self._minimum > self._threshold
 
     def reset(self) -> None:
         """Forget everything."""
         self._n = self._mean = self._total = self._minimum = 0.0
-        self.statistic = 0.0
 
     def state(self) -> dict[str, float]:
         """Return the four numbers of the test."""
@@ -83,4 +84,3 @@ class PageHinkley:
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError(f"state {state} of a Page-Hinkley test must be finite")
         self._n, self._mean, self._total, self._minimum = numbers
-        self.statistic = self._total - self._minimum

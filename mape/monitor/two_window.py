@@ -16,7 +16,7 @@ from typing import Any
 from pydantic import Field
 
 from knowledge.records import Direction
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 
 class TwoWindowConfig(PartConfig):

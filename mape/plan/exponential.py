@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import Field
 
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 
 class ExponentialConfig(PartConfig):

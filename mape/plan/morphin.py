@@ -15,8 +15,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge
-from mape.config import PartConfig
 from mape.ports import Schedule
+from mape.specs import PartConfig
 
 _new = tuple.__new__
 

@@ -10,8 +10,8 @@ from typing import Any
 from pydantic import Field
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge
-from mape.config import PartConfig
 from mape.ports import Schedule
+from mape.specs import PartConfig
 
 
 class QLearningPlannerConfig(PartConfig):

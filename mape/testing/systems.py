@@ -16,9 +16,9 @@ from knowledge import (
     RowLayout,
 )
 from mape import registry
-from mape.config import PartSpec
 from mape.execute.component import SIGNALS, Execute
 from mape.ports import Episode, ManagedSystem
+from mape.specs import PartSpec
 from mape.testing.clauses import (
     Broken,
     Finding,

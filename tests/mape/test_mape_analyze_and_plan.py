@@ -5,9 +5,9 @@ import pytest
 from knowledge import ChangeRequest, Drift, Knowledge, Log, Reading, RowLayout, Symptom
 from mape import registry
 from mape.analyze import Analyze
-from mape.config import PartSpec
 from mape.errors import ConfigError, PartError
 from mape.plan import Plan
+from mape.specs import PartSpec
 
 SIGNALS = {"return": -5.0, "steps": 5.0}
 

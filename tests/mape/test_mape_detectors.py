@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from river.drift import PageHinkley as RiverPageHinkley
 
 from mape import registry
-from mape.config import PartSpec
 from mape.errors import ConfigError
 from mape.monitor.oracle import Oracle, OracleConfig
 from mape.monitor.page_hinkley import PageHinkley, PageHinkleyConfig
 from mape.monitor.two_window import TwoWindow, TwoWindowConfig
+from mape.specs import PartSpec
 
 values = st.floats(-1e3, 1e3, allow_nan=False)
 

@@ -7,12 +7,12 @@ import pytest
 from mape_runs import GRID, TRAFFIC, Corridor, Standing, config, corridor_loop, hashes, loop_of
 
 from knowledge import ChangePlan, Knowledge, Log, QTable, RowLayout
-from mape.config import PartSpec
 from mape.errors import ConfigError, ManagedSystemError, NonFiniteError, PartError
 from mape.execute import Execute
 from mape.execute.component import SIGNALS
 from mape.execute.rules import alpha_star
 from mape.registry import build
+from mape.specs import PartSpec
 
 
 def once(episode, step, **spoilt):

@@ -3,14 +3,14 @@ import sys
 import pytest
 
 from mape import registry
-from mape.config import PartSpec
 from mape.errors import ConfigError, UnknownName
 from mape.monitor.page_hinkley import PageHinkley
+from mape.specs import PartSpec
 
 OWN = """
 import math
 from pydantic import Field
-from mape.config import PartConfig
+from mape.specs import PartConfig
 
 class Part:
     direction, statistic = "unknown", None

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mape import registry
-from mape.config import PartSpec
+from mape.specs import PartSpec
 
 NAMES = ["exponential", "success", "geometric", "constant"]
 returns = st.lists(st.sampled_from([93.0, 0.0, -37.0]), max_size=80)

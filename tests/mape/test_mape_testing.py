@@ -13,13 +13,14 @@ from adapters.systems import make_system
 from knowledge import Drift
 from mape import registry
 from mape.analyze.changes import Changes, ChangesConfig
-from mape.config import PartSpec, SystemConfig
+from mape.config import SystemConfig
 from mape.errors import PartError
 from mape.execute.rules import LearnerConfig, QLearning, expected_value
 from mape.monitor.page_hinkley import PageHinkley, PageHinkleyConfig
 from mape.monitor.two_window import TwoWindow, TwoWindowConfig
 from mape.plan.exponential import Exponential, ExponentialConfig
 from mape.plan.morphin import Morphin, MorphinConfig
+from mape.specs import PartSpec
 from mape.testing import (
     CHECKS,
     Finding,

@@ -1,0 +1,63 @@
+"""Parts as data: their options, their names in a config, and what is said of options that are not legal."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+
+class PartConfig(BaseModel):
+    """Base of all options: frozen, strict, no unknown field, no NaN or infinity."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class PartSpec(BaseModel):
+    """A part by short name or ``"module:Class"``, and its options; a string alone means no options."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
+
+    name: str = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Everything but the name."""
+        return dict(self.model_extra or {})
+
+
+def explain(error: ValidationError, prefix: str, model: type[BaseModel]) -> str:
+    """Turn what pydantic found into one sentence per field, each after `prefix` and the field's dotted name."""
+    lines = []
+    for problem in error.errors():
+        loc = ".".join(str(part) for part in problem["loc"])
+        message = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "extra_forbidden":
+            legal = _fields_at(model, problem["loc"][:-1])
+            close = difflib.get_close_matches(str(problem["loc"][-1]), legal, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else "."
+            message = f"no such option{hint} Legal: {', '.join(legal) or 'none'}"
+        elif problem["type"] == "missing":
+            message = "is needed and missing"
+        elif problem["type"] != "value_error":
+            given = problem.get("input")
+            message = f"{message[:1].lower()}{message[1:]}, got {'a table' if isinstance(given, dict) else repr(given)}"
+        lines.append(f"{prefix}{loc}: {message}" if loc else f"{prefix.rstrip(': .')}: {message}")
+    return "\n".join(lines)
+
+
+def _fields_at(model: Any, loc: tuple[Any, ...]) -> list[str]:
+    for part in loc:
+        fields = getattr(model, "model_fields", {})
+        if isinstance(part, int) or part not in fields:
+            return []
+        annotation = fields[part].annotation
+        kinds = [annotation, *getattr(annotation, "__args__", ())]
+        model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+    return list(getattr(model, "model_fields", {}))
