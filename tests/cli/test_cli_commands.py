@@ -1,6 +1,7 @@
 """Every command, as people use it."""
 
 import io
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -284,3 +285,17 @@ def test_figures_are_drawn_beside_the_tables_unless_refused(mapek: Mapek) -> Non
         f"{name}.{kind}" for name in ("learning_curve", "internal_dynamics", "q_heatmap") for kind in ("png", "pdf")
     } <= names
     assert "figures:  out/figures" in outcome.out
+
+
+def test_a_package_of_another_project_with_our_name_is_told_by_its_place(tmp_path):
+    (tmp_path / "knowledge").mkdir()
+    (tmp_path / "knowledge" / "__init__.py").write_text("")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; from adapters.cli.main import main; sys.exit(main(['list']))"],
+        env=environment, cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert f"'knowledge' is found at {tmp_path / 'knowledge' / '__init__.py'}" in done.stderr
+    assert "virtual environment" in done.stderr
