@@ -148,9 +148,9 @@ def _shadowed() -> str | None:
         found = "nowhere" if spec is None else spec.origin or "a folder without __init__.py"
         if os.path.dirname(os.path.dirname(os.path.abspath(found))) != home:
             return (
-                f"the package {name!r} is found at {found}, not beside mapek's own in {home}: a package of "
-                "another project, or a folder, stands in its way. Install mapek into a virtual environment of its own, and look "
-                "at PYTHONPATH and at the folder you stand in."
+                f"the package {name!r} is found at {found}, not beside mapek's own in {home}: a package of another "
+                "project, or a folder, stands in its way. Install mapek into a virtual environment of its own, and "
+                "look at PYTHONPATH and at the folder you stand in."
             )
     return None
 
