@@ -83,11 +83,15 @@ class Log:
         self._buffer = bytearray(layout.struct.size * SEGMENT)
         self._filled = 0  # bytes of the buffer in use
         self._hash = hashlib.sha256(layout.schema)
-        self._listeners: list[Callable[[npt.NDArray[np.void]], object]] = []
+        self._listeners: list[_Listener] = []
 
     def on_rows(self, listener: Callable[[npt.NDArray[np.void]], object]) -> None:
-        """Hand each segment of finished rows to `listener`, as a structured array that is valid during the call."""
-        self._listeners.append(listener)
+        """Hand each segment of rows that are finished from now on to `listener`.
+
+        It gets a structured array that is valid during the call. What it raises comes out of the `append` that begins
+        the next pass, or of `flush`; then the record was not taken, and the segment is offered again.
+        """
+        self._listeners.append(_Listener(listener, self._filled))
 
     def append(self, record: Record) -> Ack:
         """Take `record` if it is the next one; see the class for the answers.
@@ -104,6 +108,8 @@ class Log:
             self._finish(record)
             return _OK
         if kind is Observation:
+            if self._filled == len(self._buffer):
+                self._flush()  # before the record is taken: a listener that fails costs no row and no record
             self._open = [record]
             self._expected = Symptom
             return _OK
@@ -132,8 +138,6 @@ class Log:
         self._expected = Observation
         self.passes = self._number
         self._number += 1
-        if self._filled == len(self._buffer):
-            self._flush()
 
     def _unexpected(self, record: Record) -> Ack:
         if record.loop != self.loop:
@@ -196,10 +200,20 @@ class Log:
 
     def _flush(self) -> None:
         rows = memoryview(self._buffer)[: self._filled]
+        for listener in self._listeners:
+            if listener.told < self._filled:
+                segment = np.frombuffer(rows[listener.told :], self.layout.dtype)
+                segment.flags.writeable = False
+                listener.hear(segment)
+                listener.told = self._filled
         self._hash.update(rows)
         self._filled = 0
-        if self._listeners:
-            segment = np.frombuffer(rows, self.layout.dtype)
-            segment.flags.writeable = False
-            for listener in self._listeners:
-                listener(segment)
+        for listener in self._listeners:
+            listener.told = 0
+
+
+class _Listener:
+    # How much of the buffer a listener was told: if another one fails, nothing is told twice.
+    def __init__(self, hear: Callable[[npt.NDArray[np.void]], object], told: int) -> None:
+        self.hear = hear
+        self.told = told

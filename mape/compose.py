@@ -8,11 +8,13 @@ imports the rules by name, holds the template's source, and is compiled with ``c
 - a second process compiles nothing: the rules are module-level globals, not closures or arguments, which Numba could
   not cache;
 - no stale code is run: Numba's cache looks only at the file of the function itself, so the folder's name holds a hash
-  of the source of every module from which a rule comes, and of the versions of all that compiles.
+  of the source of every module from which a rule comes, of the global values that rules use (Numba freezes them), and
+  of the versions of all that compiles.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -23,7 +25,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from mape.errors import ConfigError
@@ -70,7 +72,7 @@ class Composed:
                 rule._write(imports, body, free, "@njit(forceinline=True)")
             else:
                 imports[free] = f"from {rule.__module__} import {rule.__qualname__} as {free}"
-        for used in template.__code__.co_names:
+        for used in sorted(_names(template.__code__)):
             if used in template.__globals__ and used not in self.bindings:
                 line = f"from {template.__module__} import {used}"
                 if imports.setdefault(used, line) != line:
@@ -87,11 +89,12 @@ class Composed:
             if isinstance(item, Composed):
                 pending += item.bindings.values()
                 item = item.template
+            item = getattr(item, "py_func", item)  # a function that its author compiled already
             if id(item) in seen or not isinstance(item, FunctionType):
                 continue
             seen.add(id(item))
             yield item
-            pending += [item.__globals__[used] for used in item.__code__.co_names if used in item.__globals__]
+            pending += [item.__globals__[used] for used in _names(item.__code__) if used in item.__globals__]
 
     def compiled(self) -> Any:
         """Return the bound function as a Numba dispatcher, from the cache where it can be.
@@ -124,9 +127,27 @@ def _versions() -> str:
 
 def _fingerprint(text: str, rules: tuple[Rule, ...]) -> str:
     digest = hashlib.sha256(f"{_versions()}\n{text}".encode())
-    for module in sorted({rule.__module__ for rule in rules}):
-        digest.update(inspect.getsource(sys.modules[module]).encode())
+    modules = {rule.__module__ for rule in rules}
+    for rule in rules:
+        plain: Any = rule
+        for used in sorted(_names(plain.__code__)):
+            value = plain.__globals__.get(used)
+            if isinstance(value, ModuleType):
+                modules.add(value.__name__)
+            elif value is not None and not callable(value):
+                # Numba freezes the value of a global, wherever it was imported from.
+                frozen = value.tobytes() if hasattr(value, "tobytes") else repr(value).encode()
+                digest.update(f"{rule.__qualname__}.{used}={getattr(value, 'dtype', '')}".encode() + frozen)
+    for module in sorted(modules):
+        with contextlib.suppress(OSError, TypeError):  # built-in modules have no source; their version is Python's
+            digest.update(inspect.getsource(sys.modules[module]).encode())
     return digest.hexdigest()[:24]
+
+
+def _names(code: CodeType) -> set[str]:
+    """Return the global names that a function uses, and those of the functions and comprehensions within it."""
+    inner = [_names(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
+    return set(code.co_names).union(*inner)
 
 
 def cache_folder() -> Path:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from mape.compose import Composed, specialise
+from mape.compose import Bindings, Composed, Rule, specialise
 from mape.execute import drive, episode
 from mape.ports import Learner, StepRules
 
@@ -17,20 +18,35 @@ Driver = Callable[..., tuple[int, int, float, float, float]]
 
 def by_rules(rules: StepRules, learner: Learner, arguments: tuple[Any, ...]) -> Driver:
     """Return the episode as one compiled call, for the types of `arguments`."""
-    begin = Composed(drive.begin_by_rules, {"phase_rule": rules.phase, "reset_rule": rules.reset})
-    act = Composed(drive.act_by_rules, {"step_rule": rules.step})
-    bound: dict[str, Any] = {"begin": begin, "act": act, "explorable": rules.explorable}
-    return specialise(Composed(episode.episode, bound | _of(learner)).compiled(), arguments)
+    six = (rules.phase, rules.reset, rules.step, rules.explorable, learner.value, learner.step_size)
+    return specialise(_compiled(*six), arguments)
+
+
+@functools.cache
+def _compiled(phase: Rule, reset: Rule, step: Rule, explorable: Rule, value: Rule, step_size: Rule) -> Any:
+    # Once per process: reading the sources for their hash costs as much as hundreds of episodes.
+    begin = Composed(drive.begin_by_rules, {"phase_rule": phase, "reset_rule": reset})
+    act = Composed(drive.act_by_rules, {"step_rule": step})
+    bound: Bindings = {
+        "begin": begin,
+        "act": act,
+        "explorable": explorable,
+        "value": value,
+        "step_size": step_size,
+    }
+    return Composed(episode.episode, bound).compiled()
 
 
 def by_calls(learner: Learner) -> Driver:
     """Return the episode as plain Python that calls the system's `step`."""
-    bound = {
+    bound: Bindings = {
         "begin": drive.begin_by_calls,
         "act": drive.act_by_calls,
         "explorable": drive.explorable_by_calls,
+        "value": learner.value,
+        "step_size": learner.step_size,
     }
-    plain = Composed(episode.episode, bound | _of(learner)).python()
+    plain = Composed(episode.episode, bound).python()
 
     def quiet(*arguments: Any) -> Any:
         # What overflows is refused by the episode itself, with the number in the message.
@@ -38,7 +54,3 @@ def by_calls(learner: Learner) -> Driver:
             return plain(*arguments)
 
     return quiet
-
-
-def _of(learner: Learner) -> dict[str, Any]:
-    return {"value": learner.value, "step_size": learner.step_size}

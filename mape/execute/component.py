@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from knowledge import ChangePlan, Knowledge, Observation, QTable
 from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
-from mape.execute import binding, episode
+from mape.execute import binding, drive, episode
 from mape.execute.refusals import refused
 from mape.execute.rules import rate_array
 from mape.ports import Episode, Learner, ManagedSystem
@@ -101,13 +101,17 @@ class Execute:
         self._context = np.zeros(len(system.signal_names))
         self._no_trace = np.empty((0, len(episode.TRACE_COLUMNS)))
         self._tail = (learner.discount, learner.bootstrap_terminal, mask_greedy, reset_draws, step_draws, cap)
-        self._target: Any = system if self._rules is None else self._rules.params
+        self._called = drive.Called(system)
+        self._target: Any = self._called if self._rules is None else self._rules.params
         self._available: tuple[int, ...] = ()
         self._rate = rate_array((0.0,) * len(learner.rate_names))
 
+        self._begun = 0  # the episode whose reset has been done ahead of its drive
         first = system.available(1)
-        if first is None:
-            first = self._begin(1, np.zeros(self._width))
+        if first is None:  # only a reset can tell; episode 1 then goes on from it
+            self._draw()
+            first = self._begin(1, self._uniforms[: self._width])
+            self._begun = 1
         self._take_actions(first, 1)
         self._set_table(QTable(first, system.n_states))
         self._drive = (
@@ -125,25 +129,27 @@ class Execute:
     def adopt(self, plan: ChangePlan) -> None:
         """Put a plan in force: enable actions, grow or shrink the Q-table, or take a remembered one.
 
+        A plan that is refused changes nothing.
+
         Raises
         ------
         PartError
-            The plan names an action that cannot be dropped, or a table that is not remembered.
+            The plan names an action that cannot be dropped or enabled, a table that is not remembered or does not fit,
+            or a learning rate that does not.
+        ManagedSystemError
+            The system raised while it enabled an action.
         """
         _, _, _, rate, add, drop, enable, _, adopt = plan
+        rates = self._rate
+        changed = self.plan is None or (rate is not self.plan.learning_rate and rate != self.plan.learning_rate)
+        if changed:
+            rates = self._checked_rate(plan)
         if add or drop or enable or adopt is not None:
-            self._change_table(plan)
-        if self.plan is None or (rate is not self.plan.learning_rate and rate != self.plan.learning_rate):
-            if len(plan.learning_rate) != len(self.learner.rate_names):
-                raise PartError(
-                    f"plan {plan.pass_no} has {len(plan.learning_rate)} learning-rate parameters; the learner takes "
-                    f"{len(self.learner.rate_names)}: {', '.join(self.learner.rate_names)}"
-                )
-            self._rate = rate_array(plan.learning_rate)
-            if not np.isfinite(self._rate).all():
-                raise PartError(
-                    f"plan {plan.pass_no} has the learning rate {plan.learning_rate}; it is of finite numbers"
-                )
+            table = self._table_after(plan)
+            self._enable(plan)
+            self._set_table(table)
+        if changed:
+            self._rate = rates
             self._fix_arguments()
         self.plan = plan
 
@@ -163,13 +169,15 @@ class Execute:
         number = self.passes + 1
         turn = self.passes % self._per_refill
         if turn == 0 and self._drawn != self.passes:  # an episode that failed is driven again with the same block
-            self._generator.random(out=self._uniforms)
-            self._drawn = self.passes
+            self._draw()
         at = turn * self._width
 
         available = self.system.available(number) if self._rules is not None else None
         if available is None:
-            available = self._begin(number, self._uniforms[at : at + self._width])
+            if self._begun == number:
+                available, self._begun = self._available, 0
+            else:
+                available = self._begin(number, self._uniforms[at : at + self._width])
         if available is not self._available:
             self._take_actions(available, number)
             self._set_rows()
@@ -235,10 +243,16 @@ class Execute:
             *self._tail,
         )
 
+    def _draw(self) -> None:
+        self._generator.random(out=self._uniforms)
+        self._drawn = self.passes
+
     def _begin(self, number: int, block: npt.NDArray[np.float64]) -> tuple[int, ...]:
-        seed = int(np.random.SeedSequence((*self._seeds, number)).generate_state(1)[0])
+        seed, *key = self._seeds
+        sequence = np.random.SeedSequence(entropy=seed, spawn_key=(*key, number))
+        told = Episode(number, int(sequence.generate_state(1)[0]), block[: self._system_draws])
         try:
-            _, available = self.system.begin(Episode(number, seed, block[: self._system_draws]))
+            self._called.state, available = self.system.begin(told)
         except MapekError:
             raise
         except Exception as error:
@@ -296,13 +310,23 @@ class Execute:
         self._choices = np.empty_like(self._rows)
         self._fix_arguments()
 
-    def _change_table(self, plan: ChangePlan) -> None:
+    def _checked_rate(self, plan: ChangePlan) -> npt.NDArray[np.float64]:
+        names = self.learner.rate_names
+        if len(plan.learning_rate) != len(names):
+            raise PartError(
+                f"plan {plan.pass_no} has {len(plan.learning_rate)} learning-rate parameters; the learner takes "
+                f"{len(names)}: {', '.join(names)}"
+            )
+        rates: npt.NDArray[np.float64] = rate_array(plan.learning_rate)
+        if not np.isfinite(rates).all():
+            raise PartError(f"plan {plan.pass_no} has the learning rate {plan.learning_rate}; it is of finite numbers")
+        return rates
+
+    def _table_after(self, plan: ChangePlan) -> QTable:
         try:
             table = self.q_table.copy() if plan.adopt is None else self._knowledge.recall(plan.adopt)
             table.add(plan.add)
             table.drop(plan.drop)
-            if plan.enable:
-                self.system.enable(plan.enable)
         except (LookupError, ValueError) as error:
             raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
         if table.n_states != self.system.n_states:
@@ -310,11 +334,28 @@ class Execute:
                 f"plan {plan.pass_no} adopts a Q-table of {table.n_states} states; {self.system.name} has "
                 f"{self.system.n_states}"
             )
-        if plan.enable:
-            after = self.system.available(self.passes + 1)
-            if after is not None:
-                self._available = after
-        self._set_table(table)
+        if not set(table.actions) & {*self._available, *plan.enable}:
+            raise PartError(
+                f"plan {plan.pass_no} leaves a Q-table of the actions {table.actions}; {self.system.name} offers "
+                f"{self._available}, of which at least one must stay"
+            )
+        return table
+
+    def _enable(self, plan: ChangePlan) -> None:
+        if not plan.enable:
+            return
+        try:
+            self.system.enable(plan.enable)
+        except ValueError as error:
+            raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
+        except Exception as error:
+            raise ManagedSystemError(
+                f"{self.system.name} raised {type(error).__name__}: {error}, while it enabled the actions "
+                f"{plan.enable} of plan {plan.pass_no}"
+            ) from error
+        after = self.system.available(self.passes + 1)
+        if after is not None:
+            self._available = after
 
     def _roll_back(self) -> None:
         values = self.q_table.values.reshape(-1)

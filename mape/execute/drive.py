@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mape.execute.rules import Floats
+from mape.ports import ManagedSystem
 
 # Bound by `mape.compose`.
 phase_rule: Any = None
@@ -26,20 +27,27 @@ def act_by_rules(
     return next_state, reward, terminated, False
 
 
-def begin_by_calls(system: Any, number: int, draws: Floats, at: int) -> tuple[int, int]:
+class Called:
+    """A system that is driven by calls: its methods, and the state that its last reset gave."""
+
+    def __init__(self, system: ManagedSystem) -> None:
+        self.state = 0
+        self.step = system.step
+        self.explorable = system.explorable
+
+
+def begin_by_calls(called: Called, number: int, draws: Floats, at: int) -> tuple[int, int]:
     """Hand on the state that the system's reset gave; calls know no phase."""
-    return 0, system.first_state
+    return 0, called.state
 
 
 def act_by_calls(
-    system: Any, phase: int, state: int, action: int, draws: Floats, at: int, context: Floats
+    called: Called, phase: int, state: int, action: int, draws: Floats, at: int, context: Floats
 ) -> tuple[int, float, bool, bool]:
     """Call the system's step."""
-    result: tuple[int, float, bool, bool] = system.step(int(action), context)
-    return result
+    return called.step(int(action), context)
 
 
-def explorable_by_calls(system: Any, phase: int, state: int, action: int) -> bool:
+def explorable_by_calls(called: Called, phase: int, state: int, action: int) -> bool:
     """Ask the system, whose mask is that of the present state."""
-    answer: bool = system.explorable(int(action))
-    return answer
+    return called.explorable(int(action))

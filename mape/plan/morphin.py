@@ -76,7 +76,7 @@ class Morphin:
         if drifts or add or drop:
             if drifts and self._to_enable:
                 enable, self._to_enable = self._to_enable, ()
-                add += tuple(a for a in enable if a not in add and a not in knowledge.actions)
+                add += tuple(a for a in enable if a not in add)
             # A new action changes what returns are possible: the test's past is no longer the null hypothesis.
             reset = bool((request.added and self._added) or (drop and self._removed))
             if reset or (drifts and self._drift):

@@ -55,7 +55,6 @@ class Corridor:
         self.signal_names = signal_names
         self._offers = offers
         self._spoil = spoil
-        self.first_state = 2
         self.begun = []
         self.enabled = ()
 

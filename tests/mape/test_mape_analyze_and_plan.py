@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from knowledge import ChangeRequest, Drift, Knowledge, Log, Reading, RowLayout, Symptom
+from knowledge import ChangeRequest, Drift, Knowledge, Log, QTable, Reading, RowLayout, Symptom
 from mape import registry
 from mape.analyze import Analyze
 from mape.errors import ConfigError, PartError
@@ -143,7 +143,11 @@ def test_a_new_action_alone_enables_no_reserve():
 
 def test_an_enabled_action_that_has_a_row_already_gets_no_second_one():
     part = planner(enable_on_drift=[2, 3, 4])
-    assert asked(part, request(1, drift=True, added=(4,)))[0].add == (4, 3)
+    asked_for = asked(part, request(1, drift=True, added=(4,)))[0].add
+    assert asked_for == (4, 2, 3)
+    table = QTable((0, 1, 2), n_states=1)
+    table.add(asked_for)
+    assert table.actions == (0, 1, 2, 4, 3)
 
 
 def test_q_learning_never_responds_and_yet_follows_the_action_set():

@@ -137,3 +137,14 @@ def test_binding_leaves_the_template_as_it_is():
     Composed(plus_one, {"rule": abs}).python()
     with pytest.raises(NameError):
         plus_one(1)
+
+
+def test_a_constant_that_is_imported_and_edited_is_seen(tmp_path):
+    (tmp_path / "a_constant.py").write_text("STEP = 1.0\nTABLE = (1, 2)\n")
+    (tmp_path / "a_rule.py").write_text(
+        "from a_constant import STEP, TABLE\n\n\ndef rule(x):\n    return x + STEP + TABLE[0]\n"
+    )
+    (tmp_path / "a_template.py").write_text(TEMPLATE)
+    assert fresh_process(tmp_path, RUN).split()[0].strip("[,") == "6.0"
+    (tmp_path / "a_constant.py").write_text("STEP = 50.0\nTABLE = (1, 2)\n")
+    assert fresh_process(tmp_path, RUN).split()[0].strip("[,") == "55.0"

@@ -399,7 +399,7 @@ def test_each_episode_gets_a_seed_and_a_number_of_its_own_by_seed_loop_and_trial
         execute.adopt(first_plan())
         for _ in range(5):
             execute.drive()
-        return [(e.number, e.seed) for e in system.begun[1:]]
+        return [(e.number, e.seed) for e in system.begun]
 
     assert [number for number, _ in begun()] == [1, 2, 3, 4, 5]
     assert begun() == begun()
@@ -449,3 +449,43 @@ def test_the_mask_limits_the_greedy_choice_too_where_config_says_so():
 
     assert greedy_moves_against_walls(mask_greedy=False) > 0
     assert greedy_moves_against_walls(mask_greedy=True) == 0
+
+
+def test_a_system_with_the_ports_members_alone_runs_and_is_reset_once_per_episode():
+    corridor = Corridor()
+    loop = corridor_loop(corridor)
+    loop.run(5)
+    assert [episode.number for episode in corridor.begun] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        {"drop": (1,), "learning_rate": (0.1, 0.2)},
+        {"drop": (1,), "learning_rate": (math.nan, 0.9, 5.0)},
+        {"add": (5,), "drop": (0, 1)},
+        {"drop": (1,), "adopt": "ab" * 32},
+    ],
+)
+def test_a_plan_that_is_refused_changes_nothing(refused):
+    loop = corridor_loop()
+    loop.run(2)
+    execute = loop.execute
+    before = (execute.plan, execute.q_table.actions, execute.q_table.sha256(), loop.knowledge.actions)
+    with pytest.raises(PartError, match="plan 3"):
+        execute.adopt(execute.plan._replace(pass_no=3, **refused))
+    assert (execute.plan, execute.q_table.actions, execute.q_table.sha256(), loop.knowledge.actions) == before
+    loop.run(3)
+    assert loop.log.passes == 5
+
+
+def test_a_system_that_raises_while_it_enables_is_named():
+    class Stuck(Corridor):
+        def enable(self, actions):
+            raise RuntimeError("relay stuck")
+
+    loop = corridor_loop(Stuck())
+    loop.run(1)
+    with pytest.raises(ManagedSystemError, match=r"corridor raised RuntimeError: relay stuck.*\(7,\) of plan 2"):
+        loop.execute.adopt(loop.execute.plan._replace(pass_no=2, add=(7,), enable=(7,)))
+    assert loop.execute.q_table.actions == (0, 1)

@@ -175,3 +175,25 @@ def test_a_closed_bus_delivers_nothing_more():
     made.send(plan(0))
     made.close()
     assert made.run() == 0
+
+
+def test_a_listener_that_fails_costs_no_row_and_no_record():
+    disturbed, undisturbed = (loop_of(config(episodes=600)) for _ in range(2))
+    heard, also = [], []
+    faults = iter([True])
+
+    def fragile(rows):
+        if next(faults, False):
+            raise OSError("no room")
+        heard.extend(rows["pass"].tolist())
+
+    disturbed.log.on_rows(lambda rows: also.extend(rows["pass"].tolist()))
+    disturbed.log.on_rows(fragile)
+    with pytest.raises(OSError, match="no room"):
+        disturbed.run(600)
+    assert disturbed.log.passes == 512
+    assert disturbed.execute.plan.pass_no == 512
+    disturbed.log.flush()
+    undisturbed.run(512)
+    assert heard == also == list(range(1, 513))
+    assert disturbed.log.sha256() == undisturbed.log.sha256()
