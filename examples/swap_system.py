@@ -12,7 +12,7 @@ class Levers(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.best = 0 if options["episode"] <= 50 else 2
+        self.best = 0 if (options or {}).get("episode", 1) <= 50 else 2
         return 0, {}
 
     def step(self, action):
@@ -22,5 +22,7 @@ class Levers(gymnasium.Env):
 gymnasium.register("Levers-v0", Levers, max_episode_steps=10)
 
 if __name__ == "__main__":
-    config = load("examples/frozen_lake.toml", overrides=["system={id='Levers-v0'}", "episodes=200"])
-    print(run_trial(config, 0, make_system))
+    lines = ["system={id='Levers-v0'}", "episodes=200", "plan.schedule.decay=0.1"]
+    watch = 'monitor.detectors=[{name="page_hinkley", threshold=10.0}]'
+    config = load("examples/frozen_lake.toml", overrides=[*lines, watch])
+    print(run_trial(config, 0, make_system).alarms)

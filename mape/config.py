@@ -9,6 +9,7 @@ merged.
 from __future__ import annotations
 
 import json
+import sysconfig
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -199,7 +200,7 @@ def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
         text = path.read_text(encoding="utf-8")
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except FileNotFoundError:
-        raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in the folder examples") from None
+        raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in {_examples()}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
@@ -219,6 +220,11 @@ def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
     below.pop("agents", None)
     below.pop("profiles", None)
     return merge(below, table)
+
+
+def _examples() -> str:
+    installed = Path(sysconfig.get_path("data"), "share", "mapek", "examples")
+    return str(installed) if installed.is_dir() else "the folder examples of the project"
 
 
 def merge(base: Table, over: Table) -> Table:

@@ -26,7 +26,9 @@ PARTS: dict[str, dict[str, Entry]] = {
     "detector": {
         "page_hinkley": Entry("mape.monitor.page_hinkley:PageHinkley", "one-sided test for a fall of the mean"),
         "two_window": Entry("mape.monitor.two_window:TwoWindow", "z-test of two sliding windows, both sides"),
-        "oracle": Entry("mape.monitor.oracle:Oracle", "is told the episodes of the drifts; the upper bound"),
+        "oracle": Entry(
+            "mape.monitor.oracle:Oracle", "alarms at the episodes it is given; bounds detection, not return"
+        ),
     },
     "analyzer": {
         "changes": Entry("mape.analyze.changes:Changes", "every alarm is a drift; action sets are compared"),
@@ -62,6 +64,12 @@ def register(kind: str, name: str, target: str, summary: str) -> None:
     PARTS.setdefault(kind, {})[name] = Entry(target, summary)
 
 
+def look_here() -> None:
+    """Let modules in the present folder be found: the console script does not look there; `python -m` does."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+
+
 def find(kind: str, name: str) -> Any:
     """Return the class behind a short name or ``"module:Class"``.
 
@@ -80,9 +88,7 @@ def find(kind: str, name: str) -> Any:
     module_name, _, attribute = target.partition(":")
     if not module_name or not attribute:
         raise ConfigError(f'{kind} {name!r} is not of the form "module:Class", such as "my_parts:MyDetector"')
-    if os.getcwd() not in sys.path:
-        # The console script does not look where the user stands; `python -m` does.
-        sys.path.append(os.getcwd())
+    look_here()
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:

@@ -16,12 +16,12 @@ import zenoh
 
 from adapters.buses.wire import ORDERED, Wire, at_place, place, segment
 from adapters.buses.zenoh_hub import SINCE_LIMIT
-from knowledge import STAGES, Ack, Record, from_json, to_json
+from knowledge import STAGES, Ack, MalformedRecord, Record, from_json, to_json
 from mape.bus import refusal
 from mape.errors import BusError
 
 SILENCE = 0.3
-"""Seconds without a record after which Knowledge is asked whether one was missed."""
+"""Seconds without a publication after which Knowledge is asked whether one was missed."""
 
 ANSWER_WITHIN = 2.0
 """Seconds after which a query counts as lost, and is sent again."""
@@ -31,9 +31,12 @@ class ZenohBus:
     """Sends records to a `KnowledgeHub`, and delivers what it appended on the caller's thread.
 
     Nothing rests on delivery. A record is sent again until Knowledge has acknowledged it; it appends a record once
-    however often it comes. What is published has a place in the log: one that was delivered is dropped, and when one
-    is missing, or nothing comes, the bus asks Knowledge for what is there from its own place on. So a bus that joins
-    late, or comes back after its link was lost, catches up by itself.
+    however often it comes. What is published is only a hint: when one comes that may be new, or nothing comes, the bus
+    asks Knowledge for what the log holds from its own place on, and delivers that. So a bus that joins late, or comes
+    back after its link was lost, catches up by itself, and a stray or forged publication costs a question and no more.
+
+    Nobody is authenticated. Whoever reaches the endpoint may append a record, which then is in the log, or answer in
+    Knowledge's stead; only who may open the socket, or is on this host, keeps strangers out.
 
     Over a wire "nothing waits" is never known for sure. `run` returns when everything is delivered that the log held
     when it was called, and what this bus sent since. To wait for others, `run_until`.
@@ -138,7 +141,7 @@ class ZenohBus:
                 delivered += 1
             if self._closed or not self._lacks(self._sent):
                 return delivered
-            self._receive(SILENCE)
+            self._fetch()
 
     def run_until(self, condition: Callable[[], bool], timeout: float = 60.0) -> int:
         """Deliver records as they come until `condition` holds, and not one more; return how many.
@@ -198,14 +201,11 @@ class ZenohBus:
     def _receive(self, timeout: float) -> None:
         try:
             sample = self._arrived.get(timeout=timeout)
-        except Empty:
+            known = place(from_json(sample.payload.to_bytes())) < self._next
+        except (Empty, MalformedRecord):
+            known = False
+        if not known:
             self._fetch()
-            return
-        record = from_json(sample.payload.to_bytes())
-        at = place(record)
-        if self._lacks(at - 1):
-            self._fetch()
-        self._take(at, record)
 
     def _take(self, at: int, record: Record) -> None:
         if at >= self._next:
@@ -226,6 +226,8 @@ class ZenohBus:
 
     def _fetch(self) -> None:
         self._asked = True
+        while not self._arrived.empty():
+            self._arrived.get_nowait()  # published before the question, so it comes with the answer
         while True:
             number, stage = at_place(self._next)
             try:

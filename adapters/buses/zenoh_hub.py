@@ -148,12 +148,14 @@ class KnowledgeHub:
             with query:  # one that is not dropped lets its sender wait for the timeout
                 try:
                     answer(query)
-                except (ValueError, LookupError) as error:
-                    query.reply_err(str(error))
                 except Exception as error:
-                    # Such as a full disk under a listener of the log. The sender hears of it; without a reply it
-                    # would ask again.
-                    query.reply_err(f"Knowledge failed with {type(error).__name__}: {error}")
+                    # What is no fault of the query, such as a full disk under a listener of the log, is told as well;
+                    # without a reply the sender would ask again.
+                    said = str(error)
+                    if not isinstance(error, (ValueError, LookupError)):
+                        said = f"Knowledge failed with {type(error).__name__}: {error}"
+                    with suppress(Exception):  # who asked may have gone; the others have not
+                        query.reply_err(said)
 
     def _append(self, query: zenoh.Query) -> None:
         payload = query.payload

@@ -53,7 +53,15 @@ def _kind_of(name: str) -> str:
         raise UnknownName(
             "part or system", name, known, 'A part of your own is "module:Class", a system a Gymnasium id.'
         )
+    registry.look_here()
+    if _registers(name):
+        return "system"
     part = registry.find("detector", name)
+    if inspect.isclass(part) and any(base.__module__.startswith("gymnasium.") for base in part.__mro__):
+        raise ConfigError(
+            f"{name!r} is a Gymnasium environment: have its module register it, and check it under its id, "
+            f"{name.partition(':')[0]}:NAME-v0"
+        )
     if inspect.isclass(part):
         for kind, members in _MEMBERS.items():
             if all(hasattr(part, member) for member in members):
@@ -63,6 +71,20 @@ def _kind_of(name: str) -> str:
         + "; ".join(f"a {kind} has {', '.join(members)}" for kind, members in _MEMBERS.items())
         + ". Name the kind with --kind to see what is missing."
     )
+
+
+def _registers(name: str) -> bool:
+    """Whether a module, once imported, registers the environment that is named behind the colon."""
+    import importlib
+
+    from adapters.systems.checking import is_registered
+
+    module, _, identifier = name.partition(":")
+    try:
+        importlib.import_module(module)
+    except Exception:  # what is wrong with it is said where the part is looked for
+        return False
+    return is_registered(identifier)
 
 
 def _maker(kind: str, name: str) -> Callable[[], Any]:
@@ -78,5 +100,6 @@ def _system(name: str) -> list[Finding]:
     from adapters.systems import make_system
     from adapters.systems.checking import check_environment, default_view
 
+    registry.look_here()
     config: SystemConfig = default_view(name)
     return [check_environment(config), *testing.check_system(lambda: make_system(config))]

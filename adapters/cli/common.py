@@ -52,6 +52,8 @@ def open_folder(
     What is wrong with a config is said before: no folder is begun that could not be gone on with.
     """
     check_json_target(chosen)
+    if chosen.out and Path(chosen.out).exists() and not Path(chosen.out).is_dir():
+        raise ConfigError(f"--out {chosen.out!r} is a file; name a folder, which may be new")
     for agent, config in configs.items():
         check_name(agent)
         check(config)

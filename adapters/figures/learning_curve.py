@@ -12,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from adapters.figures import arrays, style
@@ -43,7 +44,7 @@ def learning_curve(
 ) -> Figure:
     """Draw the trailing mean of each agent's returns, averaged over trials, with a 95 % band and its alarms.
 
-    The value at episode e is the mean over episodes e - window + 1 to e (fewer at the start). The band is Student's t
+    The value at episode e is the mean over episodes e - window + 1 to e, of the same regime. The band is Student's t
     interval of the mean over trials. An alarm is a tick in the strip below, the darker the more trials have one there.
 
     Parameters
@@ -110,6 +111,8 @@ def learning_curve(
         )
         line.set_gid(name)
         entries.append((line, style.shorten(name)))
+    if max(values.shape[0] for values in data.values()) > 1:
+        entries.append((Patch(color=style.INK, alpha=0.22, linewidth=0.0), "95 % interval of the mean"))
     if len(shown):
         entries.append((style.drift_handle(), "true drift"))
     if alarms:
@@ -130,7 +133,8 @@ def summarise(values: Floats, window: int, keep: Sequence[int] | Ints = ()) -> C
     window
         Number of episodes.
     keep
-        Episodes at which the curve breaks: these and the ones before are among the episodes returned.
+        Episodes at which the curve breaks: these and the ones before are among the episodes returned, and no window
+        reaches back over them; else a fall would look like a slope as long as the window.
 
     Examples
     --------
@@ -146,13 +150,15 @@ def summarise(values: Floats, window: int, keep: Sequence[int] | Ints = ()) -> C
     episodes = np.union1d(spaced, np.array(breaks, dtype=np.int64))
     from_start = np.zeros((trials, length + 1))
     np.cumsum(values, axis=1, out=from_start[:, 1:])
-    begins = np.maximum(episodes - window, 0)
+    firsts = np.unique([1, *(k for k in (int(k) for k in keep) if 1 <= k <= length)])
+    begins = np.maximum(episodes - window, firsts[np.searchsorted(firsts, episodes, side="right") - 1] - 1)
     means = (from_start[:, episodes] - from_start[:, begins]) / (episodes - begins)
     mean = means.mean(axis=0)
     if trials == 1:
         return Curve(episodes, mean, mean, mean)
     half = float(stdtrit(trials - 1, 0.975)) * means.std(axis=0, ddof=1) / np.sqrt(trials)
-    return Curve(episodes, mean, mean - half, mean + half)
+    # No mean lies outside of what was seen, however wide Student's interval of few trials is.
+    return Curve(episodes, mean, np.maximum(mean - half, values.min()), np.minimum(mean + half, values.max()))
 
 
 def _strip(axes: Axes, alarms: Mapping[str, Ints], data: Mapping[str, Floats]) -> None:

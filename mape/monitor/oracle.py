@@ -1,4 +1,4 @@
-"""Oracle: told the drift. The upper bound that every detector is measured against."""
+"""Oracle: told the drifts, in `episodes`. It bounds detection (no delay, no false alarm), not the return."""
 
 from __future__ import annotations
 

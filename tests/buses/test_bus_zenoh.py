@@ -156,6 +156,69 @@ def test_what_comes_twice_over_the_wire_is_delivered_once(hub, bus):
     assert got == [plan(0), plan(1)]
 
 
+STRAYS = {
+    "nothing": b"",
+    "junk": b"\xff\xfe\x00garbage",
+    "another version": to_json(plan(1)).replace(b"Plan/1", b"Plan/2"),
+    "far ahead": to_json(plan(900)),
+    "one pass ahead": to_json(plan(2, epsilon=0.25)),
+    "exactly next": to_json(plan(1, epsilon=0.25)),
+    "of another kind": to_json(observation(900)),
+    "of another loop": to_json(plan(1)._replace(loop=3)),
+    "before the log": to_json(plan(-4)),
+    "endlessly far": to_json(plan(10**30)),
+}
+
+
+@pytest.mark.parametrize("stray", STRAYS.values(), ids=STRAYS)
+def test_what_a_stranger_publishes_is_not_delivered_and_stops_nobody(hub, bus, raw, stray):
+    got = []
+    bus.subscribe(ChangePlan, got.append)
+    bus.send(plan(0))
+    bus.run()
+    fetched = bus._next
+    raw.put(hub.wire.stream(ChangePlan), stray)
+    eventually(lambda: not bus._arrived.empty())
+    with pytest.raises(BusError, match="did not come within"):
+        bus.run_until(lambda: False, timeout=0.05)
+    assert bus._arrived.empty()
+    assert (got, bus._next) == ([plan(0)], fetched)
+    with ZenohBus(hub.wire, "b") as other:
+        for record in run_of(3):
+            other.send(record)
+    bus.run_until(lambda: len(got) == 4, timeout=5)
+    assert got == [plan(number) for number in range(4)]
+    assert bus.run() == 0
+
+
+def test_what_is_published_as_junk_is_delivered_as_the_log_holds_it(hub, bus):
+    class Garbled:
+        def __init__(self, publisher):
+            self.publisher = publisher
+
+        def put(self, payload):
+            self.publisher.put(payload[1:])
+
+    hub._publishers = {kind: Garbled(publisher) for kind, publisher in hub._publishers.items()}
+    got = []
+    for kind in STAGES:
+        bus.subscribe(kind, got.append)
+    for record in run_of(3):
+        bus.send(record)
+        bus.run_until(lambda record=record: record in got, timeout=5)
+    assert got == run_of(3)
+
+
+def test_publications_do_not_pile_up_in_a_bus_that_never_waits(hub, bus):
+    bus.subscribe(ChangePlan, print)
+    bus.send(plan(0))
+    for _ in range(3):
+        eventually(lambda: not bus._arrived.empty())
+        bus.run()
+        assert bus._arrived.empty()
+        hub._publishers[ChangePlan].put(to_json(plan(0)))
+
+
 def test_only_what_was_appended_is_published(hub, bus, raw):
     published = []
     listening = raw.declare_subscriber(
@@ -415,6 +478,36 @@ def test_what_knowledge_fails_with_is_told_to_the_sender_and_it_goes_on(hub, bus
         with pytest.raises(BusError, match="Knowledge failed with OSError: no space left on device"):
             bus.send(plan(0))
     bus.send(plan(0))
+
+
+@pytest.mark.parametrize("asked", ["_append", "_since"])
+@pytest.mark.parametrize("payload", [GOOD, b"junk"])
+def test_knowledge_outlives_one_that_asks_and_is_gone_before_the_reply(hub, bus, asked, payload):
+    tried = []
+
+    class Gone:
+        def __init__(self):
+            self.parameters = {"pass": "0", "stage": "0"}
+            self.payload = zenoh.ZBytes(payload)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def reply(self, *_):
+            tried.append("reply")
+            raise zenoh.ZError("the session is closed")
+
+        def reply_err(self, *_):
+            tried.append("error")
+            raise zenoh.ZError("the session is closed")
+
+    hub._asked.put((getattr(hub, asked), Gone()))
+    bus.send(plan(0))
+    assert tried[-1] == "error"
+    assert hub._worker.is_alive()
 
 
 # Names.

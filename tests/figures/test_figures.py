@@ -235,8 +235,16 @@ def test_the_curve_is_the_trailing_mean_with_students_interval():
     assert curve.episodes.tolist() == list(range(1, 41))
     np.testing.assert_allclose(curve.mean, means.mean(axis=1), atol=1e-12)
     half = 4.302652729911275 * means.std(axis=1, ddof=1) / np.sqrt(3)  # t of 2 degrees of freedom
-    np.testing.assert_allclose(curve.high - curve.mean, half, atol=1e-12)
-    np.testing.assert_allclose(curve.mean - curve.low, half, atol=1e-12)
+    mean = means.mean(axis=1)
+    np.testing.assert_allclose(curve.high, np.minimum(mean + half, values.max()), atol=1e-12)
+    np.testing.assert_allclose(curve.low, np.maximum(mean - half, values.min()), atol=1e-12)
+
+
+def test_no_window_reaches_back_over_a_drift():
+    values = np.concatenate([np.full((2, 20), 5.0), np.full((2, 20), -5.0)], axis=1)
+    curve = summarise(values, window=10, keep=[21])
+    assert dict(zip(curve.episodes.tolist(), curve.mean.tolist(), strict=True))[20] == 5.0
+    assert set(curve.mean[curve.episodes > 20].tolist()) == {-5.0}
 
 
 def test_a_long_curve_is_thinned_but_keeps_its_ends_and_the_drift():
