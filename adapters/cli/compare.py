@@ -38,10 +38,11 @@ def execute(chosen: argparse.Namespace) -> int:
                 "q_table_sha256": combined_hash(r.q_table_sha256 for r in results[agent]),
             }
         against = {agent: compare(returns[first], returns[agent]) for agent in configs if agent != first}
-        corrected = holm([found.p for found in against.values()])
-        for (agent, found), p in zip(against.items(), corrected, strict=True):
-            rows[agent]["against_first"] = found._asdict() | {"p_holm": p}
-        _print(chosen, configs, first, rows, against, corrected)
+        welch = holm([found.p for found in against.values()])
+        paired = holm([found.paired_p for found in against.values()])
+        for (agent, found), p, paired_p in zip(against.items(), welch, paired, strict=True):
+            rows[agent]["against_first"] = found._asdict() | {"p_holm": p, "paired_p_holm": paired_p}
+        _print(chosen, configs, first, rows, against, paired)
         figures = []
         if not chosen.no_figures:
             from adapters.experiments.pictures import pictures_of_compare
@@ -113,17 +114,20 @@ def _print(
             chosen,
             f"{agent:<{width}}{_with_sd(total):>26}{interval:>26}{_with_sd(steps):>22}{row['alarms']:>9.2f}",
         )
-    say(chosen, f"\nagainst {first}, total return")
+    say(chosen, f"\nagainst {first}, total return, paired by trial")
+    titles = f"{'difference':>14}{'95 % interval':>24}{'effect size':>13}{'Welch t':>10}{'paired p (Holm)':>17}"
+    say(chosen, f"{'':<{width}}{titles}")
+    for (agent, found), p in zip(against.items(), corrected, strict=True):
+        interval = "-" if found.interval is None else "[{:+,.0f}, {:+,.0f}]".format(*found.interval)
+        effect = "-" if found.paired_effect is None else f"{found.paired_effect:+.2f}"
+        t = "-" if found.t is None else f"{found.t:.2f}"
+        said = "-" if p is None else f"{p:.2g}"
+        say(chosen, f"{agent:<{width}}{found.difference:>+14,.0f}{interval:>24}{effect:>13}{t:>10}{said:>17}")
     say(
         chosen,
-        f"{'':<{width}}{'difference':>14}{'95 % interval':>28}{'effect size g':>15}{'Welch t':>10}{'p (Holm)':>11}",
+        "\nAll agents run on the same seeds: interval, effect size (mean / sd of the differences) and paired t test"
+        "\nrest on the differences within trials. Welch's t takes the samples as independent.",
     )
-    for (agent, found), p in zip(against.items(), corrected, strict=True):
-        interval = "" if found.interval is None else "[{:+,.0f}, {:+,.0f}]".format(*found.interval)
-        g = "-" if found.hedges_g is None else f"{found.hedges_g:+.2f}"
-        t = "-" if found.t is None else f"{found.t:.2f}"
-        corrected_p = "-" if p is None else f"{p:.2g}"
-        say(chosen, f"{agent:<{width}}{found.difference:>+14,.0f}{interval:>28}{g:>15}{t:>10}{corrected_p:>11}")
 
 
 def _with_sd(found: dict[str, Any]) -> str:

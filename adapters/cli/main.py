@@ -63,8 +63,9 @@ def parser() -> argparse.ArgumentParser:
 
     reproduce = commands.add_parser(
         "reproduce",
-        help="the paper's experiments beside the paper's numbers",
-        description="Reproduce an experiment of arXiv 2601.20714 and hold it against the printed numbers.",
+        help="the paper's experiments, table1 beside the paper's numbers",
+        description="Reproduce an experiment of arXiv 2601.20714: table1 beside the paper's numbers, jump and traffic "
+        "beside numbers found before.",
     )
     reproduce.add_argument("experiment", choices=["table1", "jump", "traffic"])
     _what_runs(reproduce)

@@ -12,7 +12,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Stage(NamedTuple):
-    """Convergence within one stage.
+    """Convergence within one stage, by the rule of the function that found it.
 
     Attributes
     ----------
@@ -66,6 +66,33 @@ def convergence(q_change: Floats, drifts: Sequence[int], threshold: float = 0.01
         at_rest = q_change[:, first - 1 : last] < threshold
         alive &= at_rest.any(axis=1)
         found.append(Stage(at_rest.argmax(axis=1)[alive] + 1, trials, last - first + 1))
+    return found
+
+
+def recovery(steps: Floats, drifts: Sequence[int], limit: int = 18, run: int = 10) -> list[Stage]:
+    """Find when performance was back: the first episode from which `run` episodes in a row have at most `limit` steps.
+
+    A measure beside the paper's, which asks whether Q rests. 18 steps are within 10 of the gridworld's shortest path of
+    8. All episodes of the row lie in the same stage, and each stage counts by itself, whatever the one before it did.
+
+    Parameters
+    ----------
+    steps
+        Shape (trials, episodes).
+    drifts
+        Episodes from which a new stage holds.
+    """
+    trials, episodes = steps.shape
+    found = []
+    for first, last in stages(episodes, drifts):
+        length = last - first + 1
+        if length < run:
+            found.append(Stage(np.empty(0, dtype=np.int64), trials, length))
+            continue
+        short = steps[:, first - 1 : last] <= limit
+        windows: npt.NDArray[np.bool_] = np.lib.stride_tricks.sliding_window_view(short, run, axis=1)
+        rows = np.all(windows, axis=2)
+        found.append(Stage(rows.argmax(axis=1)[np.any(rows, axis=1)] + 1, trials, length))
     return found
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 
 class Printed(NamedTuple):
@@ -10,6 +14,22 @@ class Printed(NamedTuple):
 
     mean: float
     sd: float
+
+
+def against(found: npt.NDArray[Any], printed: Printed | None) -> dict[str, float | None]:
+    """Return how far the mean of a sample lies from a printed one; None where that cannot be said.
+
+    Returns
+    -------
+    d : difference in the printed standard deviations, which are those of one trial.
+    z : difference in standard errors of the sample's mean, sd / sqrt(n). The paper's own n is not known, so the error
+        of its mean is left out; with as many trials as ours it would make z smaller by about sqrt(2).
+    """
+    if printed is None or len(found) == 0:
+        return {"d": None, "z": None}
+    difference = float(np.mean(found)) - printed.mean
+    sd = float(np.std(found, ddof=1)) if len(found) > 1 and np.ptp(found) > 0 else 0.0
+    return {"d": difference / printed.sd, "z": difference / (sd / math.sqrt(len(found))) if sd > 0 else None}
 
 
 # Table 1. The paper gives the spread of columns 2 and 3 in % of the absolute episode number, 300 + x and 600 + x.

@@ -27,25 +27,36 @@ class Summary(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Second sample against the first.
+    """Second sample against the first, both of the same trials.
+
+    Agents that share their trials' seeds share some of their luck, and the differences within trials are free of what
+    they share: the intervals and the `paired_` fields rest on those. Welch's test and Hedges' g take the samples as
+    independent, which they are not; they stand here for comparison with what others print.
 
     Attributes
     ----------
     difference : mean of the second minus mean of the first.
-    interval : 95 % bootstrap interval of it.
-    ratio, ratio_interval : mean of the second over mean of the first; None where that says nothing.
+    interval : 95 % bootstrap interval of it, paired: whole trials are drawn.
+    ratio, ratio_interval : mean of the second over mean of the first, and the same interval of it; None where that says
+        nothing.
     hedges_g : difference in units of the pooled standard deviation, corrected for small samples.
     t, df, p : Welch's t-test.
+    paired_effect : mean of the differences within trials over their standard deviation (Cohen's d_z).
+    paired_t, paired_df, paired_p : paired t-test.
     """
 
     difference: float
-    interval: tuple[float, float] | None
-    ratio: float | None
-    ratio_interval: tuple[float, float] | None
-    hedges_g: float | None
-    t: float | None
-    df: float | None
-    p: float | None
+    interval: tuple[float, float] | None = None
+    ratio: float | None = None
+    ratio_interval: tuple[float, float] | None = None
+    hedges_g: float | None = None
+    t: float | None = None
+    df: float | None = None
+    p: float | None = None
+    paired_effect: float | None = None
+    paired_t: float | None = None
+    paired_df: float | None = None
+    paired_p: float | None = None
 
 
 @np.errstate(all="ignore")  # what is too large for a float becomes infinite, and null in JSON
@@ -62,44 +73,78 @@ def summary(values: Floats) -> Summary:
 
 @np.errstate(all="ignore")
 def compare(first: Floats, second: Floats) -> Comparison:
-    """Compare two samples of independent trials."""
-    from scipy import stats
+    """Compare two samples whose values go together: the same trials, with the same seeds, in the same order.
 
+    What the samples cannot say is None: below two trials everything but difference and ratio, where neither sample
+    varies both tests, and where all differences are equal their interval and the paired test.
+
+    Raises
+    ------
+    ValueError
+        The samples are not of the same length.
+    """
     first, second = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    if len(first) != len(second):
+        raise ValueError(f"trials are compared in pairs; here are {len(first)} and {len(second)}")
     difference = float(second.mean() - first.mean())
     ratio = float(second.mean() / first.mean()) if first.mean() * second.mean() > 0 else None
-    n1, n2 = len(first), len(second)
-    if min(n1, n2) < 2:
-        return Comparison(difference, None, ratio, None, None, None, None, None)
+    found = Comparison(difference, ratio=ratio)
+    if len(first) < 2 or (_constant(first) and _constant(second)):
+        return found
+    found = _welch(found, first, second)
+    if ratio is not None:
+        found = found._replace(ratio_interval=_interval(_ratio, first, second))
+    return _paired(found, first, second)
+
+
+def _welch(found: Comparison, first: Floats, second: Floats) -> Comparison:
+    from scipy import stats
+
+    n = len(first)
     var1, var2 = (0.0 if _constant(sample) else float(sample.var(ddof=1)) for sample in (first, second))
-    error = var1 / n1 + var2 / n2
+    error = (var1 + var2) / n
     if error == 0:
-        return Comparison(difference, None, ratio, None, None, None, None, None)
+        return found
     # By hand: SciPy's own warns of every constant sample, and a deterministic agent gives one.
-    t = difference / math.sqrt(error)
-    share = var1 / n1 / error
-    df = 1.0 / (share**2 / (n1 - 1) + (1.0 - share) ** 2 / (n2 - 1))
-    pooled = math.sqrt(((n1 - 1) * var1 + (n2 - 1) * var2) / (n1 + n2 - 2))
-    small = 1.0 - 3.0 / (4.0 * (n1 + n2) - 9.0)
-    return Comparison(
-        difference,
-        _interval(_difference, first, second),
-        ratio,
-        _interval(_ratio, first, second) if ratio is not None else None,
-        small * difference / pooled,
-        t,
-        df,
-        float(2.0 * stats.t.sf(abs(t), df)),
+    t = found.difference / math.sqrt(error)
+    share = var1 / n / error
+    df = (n - 1) / (share**2 + (1.0 - share) ** 2)
+    small = 1.0 - 3.0 / (8.0 * n - 9.0)
+    return found._replace(
+        hedges_g=small * found.difference / math.sqrt(error * n / 2),
+        t=t,
+        df=df,
+        p=float(2.0 * stats.t.sf(abs(t), df)),
+    )
+
+
+def _paired(found: Comparison, first: Floats, second: Floats) -> Comparison:
+    from scipy import stats
+
+    differences = second - first
+    # Differences that are equal but for their rounding would give a t of 1e15.
+    rounding = 4 * np.finfo(np.float64).eps * max(np.abs(first).max(), np.abs(second).max())
+    n, sd = len(differences), float(differences.std(ddof=1))
+    if not np.ptp(differences) > rounding or sd == 0:
+        return found
+    effect = float(differences.mean()) / sd
+    t = effect * math.sqrt(n)
+    return found._replace(
+        interval=_interval(_difference, first, second),
+        paired_effect=effect,
+        paired_t=t,
+        paired_df=float(n - 1),
+        paired_p=float(2.0 * stats.t.sf(abs(t), n - 1)),
     )
 
 
 def holm(p_values: list[float | None]) -> list[float | None]:
-    """Correct p-values for their number by Holm's method; None stays None.
+    """Correct p-values for their number by Holm's method; what is None, or no finite number, comes back as None.
 
     >>> holm([0.01, None, 0.04])
     [0.02, None, 0.04]
     """
-    order = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    order = sorted((p, i) for i, p in enumerate(p_values) if p is not None and math.isfinite(p))
     corrected: list[float | None] = [None] * len(p_values)
     running = 0.0
     for rank, (p, i) in enumerate(order):
@@ -132,14 +177,14 @@ def _ratio(first: Floats, second: Floats, axis: int = -1) -> Any:
 
 
 def _interval(statistic: Callable[..., Any], *samples: Floats) -> tuple[float, float] | None:
+    """Return the 95 % bootstrap interval; several samples are paired, that is, drawn with the same indices."""
     from scipy import stats
 
-    constant = [_constant(sample) for sample in samples]
-    if all(constant):
+    if all(_constant(sample) for sample in samples):
         value = float(statistic(*samples))
         return value, value
     # Bias-corrected where the sample is small enough for its jackknife; a large one needs no correction.
-    method = "BCa" if max(len(sample) for sample in samples) <= 2000 and not any(constant) else "percentile"
+    method = "BCa" if len(samples[0]) <= 2000 else "percentile"
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # What it warns of comes back as a number that is not finite, and leaves here as None.
         warnings.simplefilter("ignore")
@@ -147,6 +192,7 @@ def _interval(statistic: Callable[..., Any], *samples: Floats) -> tuple[float, f
             samples,
             statistic,
             n_resamples=RESAMPLES,
+            paired=len(samples) > 1,
             method=method,
             vectorized=True,
             batch=500,

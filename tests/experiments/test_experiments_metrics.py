@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from adapters.cli.reproduce import shortest_path
-from adapters.experiments.metrics import Detection, convergence, detection, greedy_length, stages, trailing_mean
+from adapters.experiments.metrics import (
+    Detection,
+    convergence,
+    detection,
+    greedy_length,
+    recovery,
+    stages,
+    trailing_mean,
+)
 from adapters.systems import GymnasiumSystem, make_system
 from mape.config import SystemConfig
 
@@ -79,6 +87,28 @@ def test_a_stage_in_which_nobody_converges_has_share_0_and_no_mean() -> None:
     assert (first.share, second.share) == (0, 0)
     assert len(first.converged) == len(second.converged) == 0
     assert (first.restricted_mean(), second.restricted_mean()) == (2, 4)
+
+
+def test_performance_is_back_at_the_first_of_ten_episodes_in_a_row_with_at_most_18_steps() -> None:
+    (stage,) = recovery(np.array([[37, 37, *[18] * 10, 37], [8, *[37] * 2, *[8] * 9, 19], [*[18] * 13]]), [])
+
+    assert stage.converged.tolist() == [3, 1]
+    assert (stage.share, stage.length) == (pytest.approx(2 / 3), 13)
+
+
+def test_a_row_of_episodes_does_not_reach_over_a_drift_and_a_stage_counts_whatever_came_before() -> None:
+    steps = np.array([[37, 8, 8, 8, 8, 37], [8, 8, 37, 37, 8, 8]])
+
+    first, second = recovery(steps, [4], run=3)
+    assert (first.converged.tolist(), second.converged.tolist()) == ([], [])
+    first, second = recovery(steps, [4], run=2)
+    assert (first.converged.tolist(), second.converged.tolist()) == ([2, 1], [1, 2])
+
+
+def test_a_stage_that_is_shorter_than_the_row_shows_no_recovery() -> None:
+    first, second = recovery(np.full((2, 13), 8), [11])
+
+    assert (first.share, second.share) == (1, 0)
 
 
 def test_a_delay_counts_the_episodes_of_the_new_regime_so_an_alarm_at_once_has_delay_1() -> None:

@@ -60,23 +60,24 @@ def test_table_1_with_24_trials_lies_within_what_so_few_trials_can_say(reproduce
 @pytest.mark.long
 @pytest.mark.timeout(900)
 def test_table_1_comes_out_in_the_profile_reference(reproduce: Reproduce) -> None:
-    found = reproduce("table1", 300)
+    found = reproduce("table1", 1000, "--workers", "2")
 
     morphin, baseline = found["agents"]["morphin"], found["agents"]["q_learning"]
-    assert morphin["total_steps"]["mean"] == pytest.approx(23_292.07, rel=0.015)
-    assert morphin["total_steps"]["sd"] / morphin["total_steps"]["mean"] == pytest.approx(0.0633, abs=0.015)
-    assert baseline["total_steps"]["mean"] == pytest.approx(40_683.74, rel=0.015)
-    assert baseline["total_steps"]["sd"] / baseline["total_steps"]["mean"] == pytest.approx(0.0133, abs=0.003)
-    assert [stage["mean"] for stage in morphin["stages"][:3]] == [
-        pytest.approx(135.81, rel=0.03), pytest.approx(175.17, rel=0.04), pytest.approx(167.81, rel=0.04),
-    ]  # fmt: skip
-    assert all(stage["share"] > 0.98 for stage in morphin["stages"])
-    assert baseline["stages"][0]["mean"] == pytest.approx(256.40, rel=0.015)
-    assert all(stage["share"] < 0.02 for stage in baseline["stages"][1:])
+    assert (found["profile"], found["trials"]) == ("reference", 1000)
+    assert morphin["total_steps"]["mean"] == pytest.approx(23_292, rel=0.015)
+    assert morphin["total_steps"]["sd"] / morphin["total_steps"]["mean"] == pytest.approx(0.0633, abs=0.01)
+    assert [stage["mean"] for stage in morphin["stages"][:3]] == pytest.approx([135.81, 175.17, 167.81], rel=0.025)
+    assert [stage["share"] >= 0.99 for stage in morphin["stages"]] == [True] * 5
+    assert baseline["total_steps"]["mean"] == pytest.approx(40_684, rel=0.01)
+    assert baseline["total_steps"]["sd"] / baseline["total_steps"]["mean"] == pytest.approx(0.0133, abs=0.002)
+    assert baseline["stages"][0]["mean"] == pytest.approx(256.40, rel=0.02)
+    assert [stage["share"] < 0.02 for stage in baseline["stages"][1:]] == [True] * 4
     assert found["ratio"] == pytest.approx(1.747, abs=0.03)
     assert [drift["recall"] for drift in found["detection"]] == [1.0] * 4
-    assert [drift["delay_mean"] for drift in found["detection"]] == pytest.approx([3.0, 3.6, 3.5, 3.5], abs=0.3)
-    assert all(0.03 < drift["false_alarms"] < 0.25 for drift in found["detection"])
+    assert [drift["delay_mean"] for drift in found["detection"]] == pytest.approx([3.0, 3.6, 3.5, 3.5], abs=0.2)
+    assert all(0.05 < drift["false_alarms"] < 0.2 for drift in found["detection"])
+    # What is honest to claim: by performance the baseline does recover, in stages 3 and 5.
+    assert [stage["performance_share"] > 0.9 for stage in baseline["stages"]] == [True, False, True, False, True]
 
 
 @pytest.mark.long

@@ -14,7 +14,7 @@ from scipy import stats
 from adapters.experiments.statistics import compare, finite, holm, summary
 
 FIRST = np.array([10.0, 12.0, 9.0, 11.0, 13.0, 10.5, 9.5])
-SECOND = np.array([15.0, 14.0, 18.0, 16.5, 13.5, 30.0])
+SECOND = np.array([15.0, 14.0, 18.0, 16.5, 13.5, 30.0, 17.0])
 
 
 def test_a_summary_has_mean_deviation_of_n_minus_1_and_number() -> None:
@@ -90,23 +90,81 @@ def test_the_other_way_round_the_signs_change_and_the_ratio_is_turned_over() -> 
 
 
 def test_hedges_g_is_the_difference_over_the_pooled_deviation_with_the_correction_for_small_samples() -> None:
-    found = compare(np.array([1.0, 2.0, 3.0]), np.array([4.0, 6.0]))
+    found = compare(np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 9.0]))
 
-    # Pooled variance (2 * 1 + 1 * 2) / 3; correction 1 - 3 / (4 * 5 - 9).
-    assert found.hedges_g == pytest.approx((1 - 3 / 11) * 3 / math.sqrt(4 / 3))
+    # Pooled variance (1 + 7) / 2; correction 1 - 3 / (4 * 6 - 9).
+    assert found.hedges_g == pytest.approx((1 - 3 / 15) * 4 / 2)
 
 
 def test_a_sample_that_does_not_vary_can_be_compared_with_one_that_does() -> None:
-    found = compare(np.full(5, 20.0), SECOND)
+    found = compare(np.full(7, 20.0), SECOND)
 
     # The spread is the second's alone: a t-test of one sample against a known mean.
     single = stats.ttest_1samp(SECOND, 20.0)
-    assert (found.t, found.df, found.p) == pytest.approx((single.statistic, 5, single.pvalue))
+    assert (found.t, found.df, found.p) == pytest.approx((single.statistic, 6, single.pvalue))
+    assert (found.paired_t, found.paired_df, found.paired_p) == pytest.approx((found.t, found.df, found.p))
+
+
+def test_the_paired_test_is_that_of_scipy_and_its_effect_the_mean_over_the_deviation_of_the_differences() -> None:
+    found = compare(FIRST, SECOND)
+    paired = stats.ttest_rel(SECOND, FIRST)
+
+    assert (found.paired_t, found.paired_df, found.paired_p) == pytest.approx(
+        (paired.statistic, paired.df, paired.pvalue)
+    )
+    differences = SECOND - FIRST
+    assert found.paired_effect == pytest.approx(differences.mean() / differences.std(ddof=1))
+
+
+def test_intervals_are_those_of_the_paired_bootstrap() -> None:
+    found = compare(FIRST, SECOND)
+
+    def bootstrap(statistic: Any) -> Any:
+        return stats.bootstrap(
+            (FIRST, SECOND), statistic, paired=True, n_resamples=4999, rng=np.random.default_rng(0), batch=500
+        ).confidence_interval
+
+    assert found.interval == pytest.approx(
+        bootstrap(lambda a, b, axis=-1: np.mean(b, axis=axis) - np.mean(a, axis=axis))
+    )
+    assert found.ratio_interval == pytest.approx(
+        bootstrap(lambda a, b, axis=-1: np.mean(b, axis=axis) / np.mean(a, axis=axis))
+    )
+
+
+def test_luck_that_two_agents_share_makes_the_interval_no_wider() -> None:
+    generator = np.random.default_rng(3)
+    luck, own = generator.normal(1000, 100, 40), generator.normal(5, 10, 40)
+    found = compare(luck, luck + own)
+
+    assert found.interval is not None
+    assert found.paired_p is not None
+    assert found.p is not None
+    # A paired interval is about 4 * 10 / sqrt(40) wide; one of independent samples would be 4 * 140 / sqrt(40).
+    assert found.interval[1] - found.interval[0] < 10
+    assert found.paired_p < 0.05 < found.p
+
+
+def test_trials_that_have_no_partner_are_refused() -> None:
+    with pytest.raises(ValueError, match="7 and 6"):
+        compare(FIRST, SECOND[:6])
+
+
+@pytest.mark.parametrize("step", [0.0, 0.3, -7.0])
+def test_differences_that_are_all_equal_have_no_interval_and_no_paired_test(step: float) -> None:
+    first = np.array([0.1, 0.2, 0.7, 1e3])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = compare(first, first + step)
+
+    assert found.difference == pytest.approx(step)
+    assert (found.interval, found.paired_effect, found.paired_t, found.paired_df, found.paired_p) == (None,) * 5
+    json.dumps(found, allow_nan=False)
 
 
 @pytest.mark.parametrize(
     ("first", "second"),
-    [([1.0], [2.0, 3.0]), ([1.0, 2.0], [3.0]), ([0.1, 0.1, 0.1], [0.3, 0.3, 0.3]), ([5.0, 5.0], [5.0, 5.0])],
+    [([1.0], [2.0]), ([3.0], [3.0]), ([0.1, 0.1, 0.1], [0.3, 0.3, 0.3]), ([5.0, 5.0], [5.0, 5.0])],
 )
 def test_samples_that_say_nothing_of_spread_have_a_difference_and_no_test(
     first: list[float], second: list[float]
@@ -115,7 +173,7 @@ def test_samples_that_say_nothing_of_spread_have_a_difference_and_no_test(
 
     assert found.difference == pytest.approx(np.mean(second) - np.mean(first))
     assert found.ratio == pytest.approx(np.mean(second) / np.mean(first))
-    assert (found.interval, found.ratio_interval, found.hedges_g, found.t, found.df, found.p) == (None,) * 6
+    assert (found.interval, found.ratio_interval, *found[4:]) == (None,) * 10
 
 
 @pytest.mark.parametrize(
@@ -137,6 +195,12 @@ def test_holm_multiplies_the_smallest_by_their_number_and_never_lets_a_larger_p_
 def test_holm_leaves_out_comparisons_that_have_no_p() -> None:
     assert holm([None, 0.01, None, 0.04]) == [None, 0.02, None, 0.04]
     assert holm([None]) == [None]
+
+
+@pytest.mark.parametrize("nothing", [math.nan, math.inf, -math.inf])
+def test_a_p_that_is_no_number_counts_as_none_and_leaves_the_others_alone(nothing: float) -> None:
+    assert holm([nothing, 0.01, 0.04]) == [None, 0.02, 0.04]
+    assert holm([0.04, nothing, 0.01, nothing]) == [0.04, None, 0.02, None]
 
 
 @given(st.lists(st.none() | st.floats(0, 1)))
@@ -165,11 +229,12 @@ def test_finite_turns_everything_into_plain_json() -> None:
     assert type(finite(np.float64(0.5))) is float
 
 
-NUMBERS = st.lists(st.floats(-1e12, 1e12) | st.sampled_from([0.0, 0.1, -37.0]), min_size=1, max_size=5)
+NUMBER = st.floats(-1e12, 1e12) | st.sampled_from([0.0, 0.1, -37.0])
 
 
-@given(NUMBERS, NUMBERS)
-def test_no_statistic_warns_or_puts_a_number_into_json_that_is_none(first: list[float], second: list[float]) -> None:
+@given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=5))
+def test_no_statistic_warns_or_puts_a_number_into_json_that_is_none(pairs: list[tuple[float, float]]) -> None:
+    first, second = ([pair[i] for pair in pairs] for i in (0, 1))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = [summary(np.array(first))._asdict(), compare(np.array(first), np.array(second))._asdict()]
