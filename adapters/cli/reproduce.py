@@ -53,7 +53,7 @@ def execute(chosen: argparse.Namespace) -> int:
         if not chosen.no_figures:
             from adapters.experiments import pictures
 
-            figures = getattr(pictures, f"pictures_of_{chosen.experiment}")(folder, results)
+            figures = getattr(pictures, f"pictures_of_{chosen.experiment}")(folder)
         finish(chosen, folder, result, figures)
     return 0
 

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from adapters.cli.common import config_of, finish, open_folder, prepare, say
 from adapters.cli.sentences import sentence
@@ -32,7 +33,7 @@ def execute(chosen: argparse.Namespace) -> int:
             {label: config}, folder, workers=chosen.workers, trace=chosen.trace, quiet=chosen.quiet, prepare=watch
         )[label]
         result = as_json(config, results)
-        _report(chosen, config, results, folder.episodes(label, "return", "steps"))
+        _report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
         figures = []
         if not chosen.no_figures:
             from adapters.experiments.pictures import pictures_of_run
@@ -63,22 +64,26 @@ def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
     }
 
 
-def _report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], episodes: dict[str, Any]) -> None:
-    tail = min(100, config.episodes)
-    returns = episodes["return"][:, -tail:].mean(axis=1)
+def _report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], last: npt.NDArray[Any]) -> None:
+    """Print what came out; `last` are the returns of the last episodes of each trial."""
     steps = summary(np.array([r.total_steps for r in results]))
-    late = summary(returns)
+    late = summary(last.mean(axis=1))
     say(chosen, f"{config.name}: {config.description or config.system.id}")
+    say(chosen, f"system:   {config.system.id}")
     say(chosen, f"episodes: {config.episodes:,}, trials: {config.trials:,}, seed: {config.seed}")
     say(chosen, f"steps:    {_with_sd(steps)} in total")
-    say(chosen, f"return:   {_with_sd(late)}, mean of the last {tail} episodes")
+    say(chosen, f"return:   {_with_sd(late)}, mean of the last {last.shape[1]} episodes")
     if config.trials == 1:
         alarms = ", ".join(map(str, results[0].alarms)) or "none"
         say(chosen, f"alarms:   {alarms}" + (" (episodes)" if results[0].alarms else ""))
     else:
         say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per trial")
-    say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)}")
-    say(chosen, f"Q-table:  {combined_hash(r.q_table_sha256 for r in results)}")
+    if config.trials == 1:
+        say(chosen, f"log:      {results[0].log_sha256}")
+        say(chosen, f"Q-table:  {results[0].q_table_sha256}")
+    else:
+        say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)} (of all trials)")
+        say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)} (of all trials)")
 
 
 def _with_sd(found: Any) -> str:

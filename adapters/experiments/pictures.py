@@ -21,17 +21,21 @@ from adapters.results import RunFolder
 from adapters.results.files import cannot_write
 from adapters.systems import make_system
 from mape.config import Config
-from mape.trials import TrialResult
 
 NAMES = {
     "morphin": "MORPHIN",
     "q_learning": "Q-learning",
     "success_rule": "MORPHIN, success rule",
-    "fixed_alpha": "fixed learning rate",
+    "tuned_q_learning": "Q-learning, tuned",
+    "q_learning_alpha_09": "Q-learning, alpha 0.9",
+    "fixed_alpha": "fixed alpha 0.1",
+    "fixed_alpha_09": "fixed alpha 0.9",
+    "no_detector": "no detector",
+    "oracle_detector": "oracle detector",
+    "two_window": "two-window test",
     "same_actions": "Q-learning, 5 actions",
     "three_actions": "MORPHIN, 3 actions",
 }
-Results = Mapping[str, list[TrialResult]]
 
 
 def pictures_of_run(folder: RunFolder, agent: str) -> list[Path]:
@@ -45,7 +49,7 @@ def pictures_of_run(folder: RunFolder, agent: str) -> list[Path]:
     return made
 
 
-def pictures_of_table1(folder: RunFolder, results: Results) -> list[Path]:
+def pictures_of_table1(folder: RunFolder) -> list[Path]:
     """Draw the internal dynamics of trial 0, both agents' Q, and convergence per stage."""
     drifts = _drifts(folder.configs["morphin"])
     found = {_name(a): stages_of(folder.episodes(a, "q_change")["q_change"], drifts) for a in folder.configs}
@@ -57,7 +61,7 @@ def pictures_of_table1(folder: RunFolder, results: Results) -> list[Path]:
     return made
 
 
-def pictures_of_jump(folder: RunFolder, results: Results) -> list[Path]:
+def pictures_of_jump(folder: RunFolder) -> list[Path]:
     """Draw the agents' Q with the jumps, and the steps per episode."""
     made = _put(folder, _heatmaps(folder, tuple(folder.configs)), "q_heatmaps")
     jump_from = folder.configs["morphin"].system.options.get("jump_from")
@@ -67,9 +71,9 @@ def pictures_of_jump(folder: RunFolder, results: Results) -> list[Path]:
     return made + _put(folder, figure, "steps")
 
 
-def pictures_of_traffic(folder: RunFolder, results: Results) -> list[Path]:
+def pictures_of_traffic(folder: RunFolder) -> list[Path]:
     """Draw the learning curves with drifts and detections."""
-    return _put(folder, _curve(folder, tuple(folder.configs), window=500, results=results), "learning_curve")
+    return _put(folder, _curve(folder, tuple(folder.configs), window=500), "learning_curve")
 
 
 def pictures_of_compare(
@@ -106,7 +110,7 @@ def _is_grid(config: Config) -> bool:
     return config.system.id == "mapek/Gridworld-v0"
 
 
-def _curve(folder: RunFolder, agents: tuple[str, ...], window: int, results: Results | None = None) -> Figure:
+def _curve(folder: RunFolder, agents: tuple[str, ...], window: int) -> Figure:
     curves, detections = {}, {}
     for agent in agents:
         columns = folder.episodes(agent, "return", "alarm")
@@ -114,9 +118,8 @@ def _curve(folder: RunFolder, agents: tuple[str, ...], window: int, results: Res
         if folder.configs[agent].monitor.detectors:
             detections[_name(agent)] = (np.nonzero(columns["alarm"])[1] + 1).tolist()
     ylabel = f"return (mean of {window} episodes)" if window > 1 else "return"
-    return learning_curve(
-        curves, drifts=_drifts(folder.configs[agents[0]]), detections=detections, window=window, ylabel=ylabel
-    )
+    shared = set.intersection(*({*_drifts(folder.configs[agent])} for agent in agents))
+    return learning_curve(curves, drifts=sorted(shared), detections=detections, window=window, ylabel=ylabel)
 
 
 def _dynamics(folder: RunFolder, agent: str, steps: npt.NDArray[np.void]) -> Figure:
@@ -140,12 +143,13 @@ def _heatmaps(folder: RunFolder, agents: tuple[str, ...]) -> Figure:
     system = make_system(config.system)
     try:
         base: Any = system.env.unwrapped
-        rules = base.rules
+        rules = system.rules
+        assert rules is not None
         phase = rules.phase(rules.params, config.episodes)
         panels = []
         for agent in agents:
             values, actions = folder.q_tables(agent)[0]
-            panels.append(Panel(_name(agent), values, actions, phase % len(base.goals)))
+            panels.append(Panel(f"trial 0: {_name(agent)}", values, actions, phase % len(base.goals)))
         rows, columns = base.size
         return q_heatmaps(panels, rows=rows, columns=columns, walls=base.walls, goals=base.goals, start=base.start)
     finally:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
@@ -27,10 +27,19 @@ from mape.trials import TrialResult, chunks, each_completed
 
 CHUNK_SECONDS = 0.8
 PASS_SECONDS, STEP_SECONDS = 20e-6, 10e-6  # rough costs of a pass, and of a step that is not compiled
+TRIAL_SECONDS = 5e-3  # a trial's own: its system, its components, its table
+CHUNK_BYTES = 16_000_000  # of Q-tables, which a worker holds until its chunk is written
 
 
 Task = tuple[str, int, int, str, tuple[int, int] | None]
 """Arguments of `run_chunk`."""
+
+
+class Checked(NamedTuple):
+    """What making a config's parts tells about the cost of a trial."""
+
+    compiled: bool
+    table_bytes: int
 
 
 class Stopped(MapekError):
@@ -75,9 +84,9 @@ def run_agents(
     finished = {agent: folder.finished(agent) for agent in configs}
     tasks: list[Task] = []
     for agent, config in configs.items():
-        compiled = check(config)
+        checked = check(config)
         missing = [trial for trial in range(config.trials) if trial not in finished[agent]]
-        for first, count in chunks(missing, chunk_size(config, compiled)):
+        for first, count in chunks(missing, chunk_size(config, checked)):
             tasks.append((config.to_json(), first, count, folder.chunk_stem(agent, first, count), trace))
     total = sum(config.trials * config.episodes for config in configs.values())
     done = sum(len(finished[agent]) * config.episodes for agent, config in configs.items())
@@ -105,15 +114,16 @@ def run_agents(
     return {agent: [found[trial] for trial in sorted(found)] for agent, found in results.items()}
 
 
-def chunk_size(config: Config, compiled: bool) -> int:
-    """Return how many trials make about a second of work."""
+def chunk_size(config: Config, checked: Checked) -> int:
+    """Return how many trials make about a second of work, with Q-tables that fit into a worker's memory."""
     cap = config.system.max_steps or 200
-    episode = PASS_SECONDS if compiled else PASS_SECONDS + cap * STEP_SECONDS
-    return max(1, int(CHUNK_SECONDS / (config.episodes * episode)))
+    episode = PASS_SECONDS if checked.compiled else PASS_SECONDS + cap * STEP_SECONDS
+    trials = CHUNK_SECONDS / (TRIAL_SECONDS + config.episodes * episode)
+    return max(1, int(min(trials, CHUNK_BYTES / checked.table_bytes)))
 
 
-def check(config: Config) -> bool:
-    """Make all that a config names, once, and say whether its episodes are compiled.
+def check(config: Config) -> Checked:
+    """Make all that a config names, once, and say what that tells about the cost of a trial.
 
     In this process first: what is wrong with a config is said at once, and the compiled code is in the cache before
     several workers want it.
@@ -125,7 +135,8 @@ def check(config: Config) -> bool:
     """
     system = make_system(config.system)
     try:
-        return Loop(config, system).execute.compiled
+        execute = Loop(config, system).execute
+        return Checked(execute.compiled, execute.q_table.values.nbytes)
     finally:
         system.close()
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from adapters import detectors
 from adapters.results.files import read_json, read_npz, whole, write_json
-from adapters.results.table import COLUMNS, DTYPE, from_rows
+from adapters.results.table import DTYPE, from_rows, write_npz
 from adapters.systems import make_system
 from mape.config import from_table
 from mape.errors import MapekError, ResultsError
@@ -112,12 +112,11 @@ def run_chunk(
 def _break_off(file: IO[bytes], rows: int, target: Path) -> None:
     """Cut the rows of a broken trial off a chunk, and store them by themselves."""
     file.flush()
-    table = np.fromfile(file.name, DTYPE, offset=rows * DTYPE.itemsize)
+    broken = os.stat(file.name).st_size // DTYPE.itemsize - rows
+    if broken:
+        write_npz(target, [Path(file.name)], broken, skip=rows)
     file.truncate(rows * DTYPE.itemsize)
     file.seek(0, 2)
-    if len(table):
-        with whole(target) as store:
-            np.savez(store, allow_pickle=False, **{name: table[name] for name in COLUMNS})
 
 
 def read_chunk(stem: Path) -> list[TrialResult] | None:

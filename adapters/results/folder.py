@@ -14,6 +14,7 @@ figures/              PNG and PDF
 from __future__ import annotations
 
 import fcntl
+import itertools
 import json
 import os
 import platform
@@ -30,7 +31,7 @@ import numpy.typing as npt
 
 from adapters.results.chunk import read_arrays, read_chunk, remove_parts
 from adapters.results.files import cannot_write, read_json, read_npz, whole, write_json
-from adapters.results.table import read_episodes, write_npz
+from adapters.results.table import read_episodes, read_last, write_npz
 from mape import __version__
 from mape.config import Config
 from mape.errors import ResultsError
@@ -51,13 +52,29 @@ def versions() -> dict[str, str]:
 
 
 def default_path(name: str) -> Path:
-    """Return a folder name that is not taken: results/NAME-DATE-TIME."""
+    """Make an empty folder that nobody else has taken, and return its path: results/NAME-DATE-TIME.
+
+    Raises
+    ------
+    ResultsError
+        It cannot be made.
+    """
     stem = Path("results", f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
-    path, n = stem, 1
-    while path.exists():
-        n += 1
-        path = stem.with_name(f"{stem.name}-{n}")
-    return path
+    for n in itertools.count(1):
+        path = stem if n == 1 else stem.with_name(f"{stem.name}-{n}")
+        try:
+            path.parent.mkdir(exist_ok=True)
+            path.mkdir()  # taken by being made: a name that is looked up first, another process can take meanwhile
+        except FileExistsError:
+            if not path.parent.is_dir():
+                raise ResultsError(
+                    f"{path.parent} is a file, and no folder for results; choose another --out"
+                ) from None
+        except OSError as error:
+            raise cannot_write(path, error) from error
+        else:
+            return path
+    raise AssertionError
 
 
 class RunFolder:
@@ -189,6 +206,10 @@ class RunFolder:
     def episodes(self, agent: str, *columns: str) -> dict[str, npt.NDArray[Any]]:
         """Return columns of the agent's table, each of shape (trials, episodes)."""
         return read_episodes(self.path / f"episodes-{agent}.npz", columns)
+
+    def last_episodes(self, agent: str, column: str, episodes: int) -> npt.NDArray[Any]:
+        """Return a column of the agent's table for the last episodes of each trial, shape (trials, episodes)."""
+        return read_last(self.path / f"episodes-{agent}.npz", column, episodes)
 
     def q_tables(self, agent: str) -> dict[int, tuple[npt.NDArray[np.float64], tuple[int, ...]]]:
         """Return values and action ids at the end of each trial."""

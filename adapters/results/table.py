@@ -17,8 +17,9 @@ actions      uint16    number of actions that were available
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -43,6 +44,9 @@ DTYPE = np.dtype(
 )
 COLUMNS: tuple[str, ...] = tuple(DTYPE.names or ())
 
+BLOCK = 65_536
+"""Rows that are held in memory at a time."""
+
 
 def from_rows(trial: int, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     """Take the table's columns from a segment of the log's rows."""
@@ -58,20 +62,26 @@ def from_rows(trial: int, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     return table
 
 
-def write_npz(path: Path, chunks: Iterable[Path], rows: int) -> None:
-    """Write chunk files as one ``.npz`` with an array per column, without holding more than a chunk in memory."""
+def write_npz(path: Path, chunks: Iterable[Path], rows: int, skip: int = 0) -> None:
+    """Write `rows` rows of chunk files as one ``.npz`` with an array per column, with a block of them in memory.
+
+    The first `skip` rows of each file are left out.
+    """
     files = list(chunks)
     with whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for column in COLUMNS:
             with archive.open(f"{column}.npy", "w", force_zip64=True) as member:
-                _write_column(member, column, files, rows)
+                _write_column(member, column, files, rows, skip)
 
 
-def _write_column(member: IO[bytes], column: str, files: list[Path], rows: int) -> None:
+def _write_column(member: IO[bytes], column: str, files: list[Path], rows: int, skip: int) -> None:
     header: dict[str, Any] = {"descr": DTYPE[column].str, "fortran_order": False, "shape": (rows,)}
     np.lib.format.write_array_header_1_0(member, header)
     for chunk in files:
-        member.write(np.ascontiguousarray(np.fromfile(chunk, DTYPE)[column]).tobytes())
+        with open(chunk, "rb") as file:
+            file.seek(skip * DTYPE.itemsize)
+            while len(block := np.fromfile(file, DTYPE, BLOCK)):
+                member.write(block[column].tobytes())
 
 
 def read_episodes(path: str | Path, columns: Iterable[str] = COLUMNS) -> dict[str, npt.NDArray[Any]]:
@@ -82,12 +92,57 @@ def read_episodes(path: str | Path, columns: Iterable[str] = COLUMNS) -> dict[st
     ResultsError
         The file is missing, cut short, or has no such column.
     """
+    with _opened(path, columns) as archive:
+        trials, _ = _shape(archive)
+        return {name: archive[name].reshape(trials, -1) for name in columns}
+
+
+def read_last(path: str | Path, column: str, episodes: int) -> npt.NDArray[Any]:
+    """Read a column's last episodes of each trial, shape (trials, episodes), with a block of the others in memory.
+
+    Raises
+    ------
+    ResultsError
+        The file is missing, cut short, or has no such column.
+    """
+    with _opened(path, (column,)) as archive:
+        trials, length = _shape(archive)
+        kept, at = [np.empty(0, DTYPE[column])], 0
+        for block in _blocks(archive, column):
+            episode = np.arange(at, at + len(block)) % length
+            kept.append(block[episode >= length - episodes])
+            at += len(block)
+        return np.concatenate(kept).reshape(trials, -1)
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path, columns: Iterable[str]) -> Iterator[Any]:
     try:
         # Opened here: `np.load` leaves a file that it cannot read open.
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             if missing := set(columns) - set(archive.files):
                 raise ResultsError(f"{path} has no column {sorted(missing)[0]!r}; it has {', '.join(archive.files)}")
-            trials = len(np.unique(archive["trial"]))
-            return {name: archive[name].reshape(trials, -1) for name in columns}
+            yield archive
     except DAMAGE as error:
         raise ResultsError(f"{path} is no whole table of episodes: {error}. Run the same command again.") from error
+
+
+def _shape(archive: Any) -> tuple[int, int]:
+    """Return the number of trials, whose rows stand together, and of the episodes of each."""
+    trials, rows, last = 0, 0, -1
+    for block in _blocks(archive, "trial"):
+        trials += int(block[0] != last) + int(np.count_nonzero(block[1:] != block[:-1]))
+        rows, last = rows + len(block), int(block[-1])
+    if not trials or rows % trials:
+        raise ValueError(f"{rows} rows are of no whole number of episodes for {trials} trials")
+    return trials, rows // trials
+
+
+def _blocks(archive: Any, column: str) -> Iterator[npt.NDArray[Any]]:
+    with archive.zip.open(f"{column}.npy") as member:
+        np.lib.format.read_magic(member)
+        (rows,), _, dtype = np.lib.format.read_array_header_1_0(member)
+        for first in range(0, rows, BLOCK):
+            size = min(BLOCK, rows - first) * dtype.itemsize
+            yield np.frombuffer(member.read(size), dtype, size // dtype.itemsize)
+        member.read(1)  # the end, where the checksum is held against what was read

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from adapters.systems.gymnasium_system import make_env
+from adapters.systems.gymnasium_system import make_env, rules_of
 from managed_systems import register_envs
 from mape.config import BoxGrid, SystemConfig
 from mape.testing import Finding
@@ -37,7 +37,7 @@ def default_view(name: str) -> SystemConfig:
             high = np.clip(np.ravel(space.high), -10.0, 10.0).tolist()
             grid = BoxGrid(low=tuple(low), high=tuple(high), bins=(3,) * size)
         capped = env.spec is not None and env.spec.max_episode_steps is not None
-        has_own = getattr(env.unwrapped, "rules", None) is not None
+        has_own = rules_of(env) is not None
         return SystemConfig(id=name, max_steps=None if capped or has_own else 200, discretise=grid)
     finally:
         env.close()

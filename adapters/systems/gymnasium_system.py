@@ -9,12 +9,17 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from adapters.systems.state_index import state_index
 from managed_systems import register_envs
+from managed_systems.rules import available
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
+
+_TRANSPARENT = (OrderEnforcing, PassiveEnvChecker, TimeLimit)
+_RULES = tuple(name for name in vars(StepRules) if not name.startswith("_"))
 
 
 def make_system(config: SystemConfig) -> GymnasiumSystem:
@@ -58,6 +63,34 @@ def make_env(config: SystemConfig) -> gymnasium.Env[Any, Any]:
         raise ConfigError(f"system {config.id!r} with options {config.options}: {error}") from error
 
 
+def rules_of(env: gymnasium.Env[Any, Any]) -> StepRules | None:
+    """Return the rules that equal the environment's steps, or None where it has none.
+
+    Rules are those of the innermost environment: whatever a wrapper does to observations, actions or rewards is not in
+    them, so they count only below wrappers that leave all as it is but for the number of steps.
+    """
+    while isinstance(env, gymnasium.Wrapper):
+        if type(env) not in _TRANSPARENT:  # a subclass may do anything
+            return None
+        env = env.env
+    return _own_rules(env)
+
+
+def _own_rules(base: Any) -> StepRules | None:
+    rules = getattr(base, "rules", None)  # the name is a common one
+    return rules if all(hasattr(rules, name) for name in _RULES) else None
+
+
+def _step_caps(env: gymnasium.Env[Any, Any]) -> list[int | None]:
+    """Return the step cap that the spec names, and those of time limits that the outermost one hides."""
+    caps = [None if env.spec is None else env.spec.max_episode_steps]
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, TimeLimit) and env.spec is not None:
+            caps.append(env.spec.max_episode_steps)
+        env = env.env
+    return caps
+
+
 class GymnasiumSystem:
     """The managed-system port over one environment.
 
@@ -78,10 +111,10 @@ class GymnasiumSystem:
         if env.action_space.n < 1:
             raise ConfigError(f"{self.name} has no action; a managed system has at least one")
         self.n_states, self._index = state_index(env.observation_space, config.discretise, self.name)
-        rules = getattr(self._base, "rules", None)
-        self.rules: StepRules | None = rules
-        spec_cap = env.spec.max_episode_steps if env.spec is not None else None
-        caps = [cap for cap in (config.max_steps, getattr(rules, "max_steps", None), spec_cap) if cap is not None]
+        self.rules: StepRules | None = rules_of(env)
+        rules: Any = _own_rules(self._base)  # what they declare holds below any wrapper
+        declared = [config.max_steps, getattr(rules, "max_steps", None), *_step_caps(env)]
+        caps = [cap for cap in declared if cap is not None]
         if not caps:
             raise ConfigError(
                 f"{self.name} has no step cap of its own, and an episode must end; set system.max_steps, such as 200"
@@ -91,10 +124,12 @@ class GymnasiumSystem:
             getattr(rules, "signal_names", getattr(self._base, "signal_names", ()))
         )
         self.drifts: tuple[int, ...] = tuple(getattr(rules, "drifts", getattr(self._base, "drifts", ())))
-        self.draws: tuple[int, int] = (rules.reset_draws, rules.step_draws) if rules is not None else (0, 0)
-        self._block = getattr(rules, "episode_draws", 0)
-        self.first_state = 0
+        self.draws: tuple[int, int] = (0, 0)
+        if self.rules is not None:
+            self.draws = (self.rules.reset_draws, self.rules.step_draws)
+        self._block = getattr(self.rules, "episode_draws", 0)
         self._mask: npt.NDArray[np.int8] | None = None
+        self._first_action = 0
         self._windows: tuple[int, int, tuple[int, ...]] | None = None
 
     def available(self, episode: int) -> tuple[int, ...] | None:
@@ -103,10 +138,10 @@ class GymnasiumSystem:
             return None
         if self._windows is None or not self._windows[0] <= episode < self._windows[1]:
             first, last = self.rules.windows.T
-            here = tuple(np.flatnonzero((first <= episode) & (episode <= last)).tolist())
-            edges = [e for e in (*first.tolist(), *(last + 1).tolist()) if e > episode]
-            begun = max([0, *(e for e in (*first.tolist(), *(last + 1).tolist()) if e <= episode)])
-            self._windows = (begun, min(edges, default=2**63), here)
+            edges = (*first.tolist(), *(last + 1).tolist())
+            begun = max((edge for edge in edges if edge <= episode), default=0)
+            ended = min((edge for edge in edges if edge > episode), default=2**63)
+            self._windows = (begun, ended, available(self.rules.windows, episode))
         return self._windows[2]
 
     def begin(self, episode: Episode) -> tuple[int, tuple[int, ...]]:
@@ -119,12 +154,13 @@ class GymnasiumSystem:
             options["uniforms"] = uniforms
         seen, info = self.env.reset(seed=episode.seed, options=options)
         self._see_mask(info)
-        self.first_state = self._index(seen)
-        if "available_actions" in info:
-            return self.first_state, tuple(int(action) for action in info["available_actions"])
+        state = self._index(seen)
         # Asked each time: an environment may reassign its action space.
         space: Any = self.env.action_space
-        return self.first_state, tuple(range(int(space.start), int(space.start + space.n)))
+        self._first_action = int(space.start)
+        if "available_actions" in info:
+            return state, tuple(int(action) for action in info["available_actions"])
+        return state, tuple(range(self._first_action, self._first_action + int(space.n)))
 
     def step(self, action: int, context: npt.NDArray[np.float64]) -> tuple[int, float, bool, bool]:
         """Act; return next state, reward, terminated, truncated."""
@@ -143,7 +179,7 @@ class GymnasiumSystem:
 
     def explorable(self, action: int) -> bool:
         """Look the action up in the present state's ``info["action_mask"]``; without one, all may be tried."""
-        return self._mask is None or bool(self._mask[action])
+        return self._mask is None or bool(self._mask[action - self._first_action])
 
     def enable(self, actions: tuple[int, ...]) -> None:
         """Switch reserve actions on.
@@ -160,9 +196,30 @@ class GymnasiumSystem:
         self._base.enable_actions(actions)
         self._windows = None
 
+    def get_state(self) -> Any:
+        """Return what the environment carries from one episode to the next, or None where it does not say."""
+        return self._base.get_state() if self._says_state() else None
+
+    def set_state(self, state: Any) -> None:
+        """Let the environment take up what `get_state` returned.
+
+        Raises
+        ------
+        ValueError
+            The environment does not take a state, or not this one.
+        """
+        if self._says_state():
+            self._base.set_state(state)
+        elif state is not None:
+            raise ValueError(f"{self.name} takes no state (no get_state and set_state); give None")
+        self._windows = None
+
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
+
+    def _says_state(self) -> bool:
+        return hasattr(self._base, "get_state") and hasattr(self._base, "set_state")
 
     def _see_mask(self, info: dict[str, Any]) -> None:
         self._mask = info.get("action_mask")

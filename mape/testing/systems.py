@@ -160,7 +160,8 @@ def _carried(system: ManagedSystem, state: Any = None) -> Any:
         return None
     if state is not None:
         optional.set_state(json.loads(state))
-    return plain_json(optional.get_state())
+    carried = optional.get_state()
+    return None if carried is None else plain_json(carried)
 
 
 def _play(system: ManagedSystem, number: int) -> list[_Moment]:
@@ -201,8 +202,7 @@ def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
     assert rules is not None
     if (rules.reset_draws, rules.step_draws) != system.draws:
         raise Broken(f"rules take {(rules.reset_draws, rules.step_draws)} uniforms, draws says {system.draws}")
-    windows = rules.windows.tolist()
-    available = tuple(action for action, (first, last) in enumerate(windows) if first <= number <= last)
+    available = system.available(number) or system.begin(_episode(system, number))[1]
     phase = rules.phase(rules.params, number)
     state = rules.reset(rules.params, phase, draws, 0)
 

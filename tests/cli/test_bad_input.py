@@ -273,7 +273,12 @@ CASES = [
         ("config.toml/new", "cannot be written", "another place"),
         ("config.toml", "--out", "config.toml/new"),
     ),
-    Case("--out onto a regular file", 1, ("config.toml", "cannot be written"), ("config.toml", "--out", "config.toml")),
+    Case(
+        "--out onto a regular file",
+        2,
+        ("config.toml", "is a file; name a folder"),
+        ("config.toml", "--out", "config.toml"),
+    ),
     other("an unknown command", 2, "'rum'", "'run', 'compare'", command="rum", arguments=()),
     other(
         "reproduce of an unknown experiment",

@@ -124,7 +124,8 @@ def test_compare_gives_null_for_what_a_sample_cannot_say(mapek: Mapek, trials: i
 
     assert found["first"] == "morphin"
     assert list(found["agents"]) == [
-        "morphin", "q_learning", "tuned_q_learning", "q_learning_alpha_09", "fixed_alpha", "fixed_alpha_09", "no_detector", "oracle_detector",
+        "morphin", "q_learning", "tuned_q_learning", "q_learning_alpha_09", "fixed_alpha", "fixed_alpha_09",
+        "no_detector", "oracle_detector",
     ]  # fmt: skip
     assert "against_first" not in found["agents"]["morphin"]
     tuned = found["agents"]["tuned_q_learning"]

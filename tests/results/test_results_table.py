@@ -94,3 +94,21 @@ def test_actions_are_counted_as_they_come(tmp_path: Path) -> None:
 
     actions = read_episodes(tmp_path / "out" / "episodes-jump.npz", ["actions"])["actions"]
     assert actions.tolist() == [[4, 4, 4, 8, 8, 8]]
+
+
+def test_the_table_is_written_in_blocks_whatever_the_number_of_episodes(tmp_path):
+    import tracemalloc
+
+    from adapters.results.table import BLOCK, DTYPE, write_npz
+
+    chunk = tmp_path / "c.rows"
+    rows = 8 * BLOCK
+    with open(chunk, "wb") as file:
+        for _ in range(8):
+            file.write(np.zeros(BLOCK, DTYPE).tobytes())
+    tracemalloc.start()
+    write_npz(tmp_path / "t.npz", [chunk], rows)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 3 * BLOCK * DTYPE.itemsize
+    assert read_episodes(tmp_path / "t.npz", ["steps"])["steps"].shape == (1, rows)
