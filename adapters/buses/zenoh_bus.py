@@ -269,6 +269,7 @@ class ZenohBus:
                     f"Knowledge on {self.wire.endpoint} did not answer within {self.patience:g} s ({outcome}). Is it "
                     "running, with the same system and loop?"
                 )
+            # No event tells that a queryable is there again; where one reply was lost, the first pause is short.
             time.sleep(pause)
             pause = min(2 * pause, 0.2)
 

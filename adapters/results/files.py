@@ -17,7 +17,10 @@ import numpy.typing as npt
 from mape.errors import ResultsError
 
 DAMAGE = (OSError, EOFError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What reading an ``.npz`` may raise where its bytes are not those that were written."""
+"""What reading an ``.npz`` may raise where its bytes are not those that were written.
+
+NotImplementedError is zipfile's word for a damaged entry that seems to ask for an unknown compression.
+"""
 
 
 @contextlib.contextmanager

@@ -73,7 +73,6 @@ class Execute:
         self.trial = trial
         self._loop = loop
         self._seeds = (seed, loop, trial)
-        self._mask_greedy = mask_greedy
         self._max_actions = max_actions
         self._own_signals = system.signal_names
         self.trace: Callable[[int, npt.NDArray[np.float64]], object] | None = None

@@ -158,7 +158,7 @@ def test_the_same_seed_gives_the_same_episodes(env):
 
 def test_a_pickled_environment_goes_on_as_the_original(env):
     env.reset(seed=3)
-    twin = pickle.loads(pickle.dumps(env))
+    twin = pickle.loads(pickle.dumps(env))  # as vectorised environments do to their copies
     assert play(twin, np.random.default_rng(0), None) == play(env, np.random.default_rng(0), None)
 
 
