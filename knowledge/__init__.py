@@ -1,5 +1,6 @@
 """Knowledge: the records, their log, the Q-table, and what the stages share. Imports nothing of ours."""
 
+from knowledge.free_log import FreeLog
 from knowledge.log import Ack, Log, Pass
 from knowledge.q_table import QTable
 from knowledge.records import (
@@ -13,6 +14,7 @@ from knowledge.records import (
     Record,
     Symptom,
     from_json,
+    json_schemas,
     to_json,
 )
 from knowledge.rows import RowLayout, actions_of
@@ -24,6 +26,7 @@ __all__ = [
     "ChangePlan",
     "ChangeRequest",
     "Drift",
+    "FreeLog",
     "Knowledge",
     "Log",
     "MalformedRecord",
@@ -36,5 +39,6 @@ __all__ = [
     "Symptom",
     "actions_of",
     "from_json",
+    "json_schemas",
     "to_json",
 ]

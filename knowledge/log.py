@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 import hashlib
+import struct
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ class Ack(enum.Enum):
 
 
 _OK = Ack.OK  # an enum's member costs a call to look up
+_PASS_NUMBER = struct.Struct("<q")  # a row begins with it
 
 
 class Pass(NamedTuple):
@@ -82,6 +84,7 @@ class Log:
         self._row_size = layout.struct.size
         self._buffer = bytearray(layout.struct.size * SEGMENT)
         self._filled = 0  # bytes of the buffer in use
+        self._flushed_row = b""  # the newest row that has left the buffer; plan 0's before there was one
         self._hash = hashlib.sha256(layout.schema)
         self._listeners: list[_Listener] = []
 
@@ -146,7 +149,8 @@ class Log:
         if number == 0 and isinstance(record, ChangePlan):
             if self._start is not None:
                 return Ack.DUPLICATE if record == self._start else Ack.CONFLICT
-            self._hash.update(self.layout.pack_start(record))
+            self._flushed_row = self.layout.pack_start(record)
+            self._hash.update(self._flushed_row)
             self._start = record
             self._number, self._expected = 1, Observation
             return _OK
@@ -156,6 +160,16 @@ class Log:
         if there is not None:
             return Ack.DUPLICATE if there == record else Ack.CONFLICT
         return Ack.DUPLICATE if number <= self.passes else Ack.GAP
+
+    @property
+    def started(self) -> bool:
+        """Whether plan 0 is there."""
+        return self._start is not None
+
+    @property
+    def open_records(self) -> tuple[Record, ...]:
+        """The records of the pass that is being logged, in order."""
+        return tuple(self._open)
 
     def find(self, kind: type[Record], number: int) -> Record | None:
         """Return the record of that kind and pass, or None where it has not come yet or has left the window."""
@@ -192,6 +206,82 @@ class Log:
         if self._filled:
             self._flush()
 
+    def last_row(self) -> bytes:
+        """Return the packed row of the newest finished pass; plan 0's after plan 0.
+
+        Raises
+        ------
+        LookupError
+            Not even plan 0 is there.
+        """
+        if self._start is None:
+            raise LookupError("the log has no row yet; plan 0 makes the first")
+        if self._filled:
+            return bytes(self._buffer[self._filled - self._row_size : self._filled])
+        return self._flushed_row
+
+    def restore(
+        self,
+        start: ChangePlan | None,
+        rows: Iterable[bytes],
+        passes: Sequence[Pass],
+        open_records: Sequence[Record],
+    ) -> None:
+        """Bring a fresh log to the state in which another one was: its hash, its window, the record expected next.
+
+        Listeners hear of the rows that are finished from then on.
+
+        Parameters
+        ----------
+        start
+            Plan 0, or None if not even that had come.
+        rows
+            The packed row of each finished pass, from pass 1 on, in order; what `last_row` gave after each pass.
+        passes
+            The newest finished passes, the last one included. None of them, and the log hashes on but remembers no
+            record.
+        open_records
+            The records of the pass after the last finished one, in order.
+
+        Raises
+        ------
+        ValueError
+            The log is not fresh, or what is given is no run: a row that is out of order, a pass whose row is another
+            one, a record that does not come next. The log is then spoilt, and another one is to be made.
+        """
+        if self._start is not None:
+            raise ValueError(f"a log of {self.passes} passes cannot be restored into; make a fresh one")
+        listeners, self._listeners = self._listeners, []
+        if start is not None:
+            self._take(start)
+        newest: deque[bytes] = deque()
+        for number, row in enumerate(rows, 1):
+            if start is None or len(row) != self._row_size or _PASS_NUMBER.unpack_from(row) != (number,):
+                raise ValueError(f"row {number} of the restored log is not the packed row of pass {number}")
+            newest.append(row)
+            if len(newest) > len(passes):  # the rows of `passes` are packed again, and compared
+                self._flushed_row = newest.popleft()
+                self._hash.update(self._flushed_row)
+                self.passes, self._number = number - len(passes), number - len(passes) + 1
+        if len(newest) < len(passes):
+            raise ValueError(f"{len(passes)} finished passes were given with the rows of {len(newest)}")
+        for finished, row in zip(passes, newest, strict=True):
+            for record in finished:
+                self._take(record)
+            if self.last_row() != row:
+                raise ValueError(f"the records of pass {self.passes} do not give its row")
+        for record in open_records:
+            self._take(record)
+        self.flush()
+        self._listeners = listeners
+
+    def _take(self, record: Record) -> None:
+        answer = self.append(record)
+        if answer is not _OK:
+            raise ValueError(
+                f"{type(record).__name__} {record.pass_no} does not come next in the restored log: {answer.value}"
+            )
+
     def sha256(self) -> str:
         """Hash the layout, plan 0 and all finished passes, as 64 hexadecimal digits."""
         digest = self._hash.copy()
@@ -207,6 +297,7 @@ class Log:
                 listener.hear(segment)
                 listener.told = self._filled
         self._hash.update(rows)
+        self._flushed_row = bytes(rows[-self._row_size :])
         self._filled = 0
         for listener in self._listeners:
             listener.told = 0

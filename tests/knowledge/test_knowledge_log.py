@@ -18,11 +18,13 @@ def filled(passes, window=256, listener=None):
     log = fresh(window)
     if listener is not None:
         log.on_rows(listener)
-    assert log.append(plan(0)) is Ack.OK
-    for number in range(1, passes + 1):
-        for record in one_pass(number, alarm=number % 5 == 0):
-            assert log.append(record) is Ack.OK
+    for record in run_of(passes):
+        assert log.append(record) is Ack.OK
     return log
+
+
+def run_of(passes):
+    return [plan(0), *(record for n in range(1, passes + 1) for record in one_pass(n, alarm=n % 5 == 0))]
 
 
 def test_the_records_of_a_run_are_taken_in_their_order():
@@ -243,3 +245,98 @@ def test_a_row_says_what_its_pass_was():
     assert (row["value"][0], row["alarm"][0], row["direction"][0], row["drift"][0]) == (-5.0, True, 1, 1)
     assert np.isnan(row["statistic"][0])
     assert row["add"].tolist() == [0b100]
+
+
+def states(log):
+    """What two logs that are the same must agree on, besides what they answer."""
+    return log.sha256(), log.passes, list(log.window), log.last_row(), list(log.since(log.passes + 1))
+
+
+@given(st.data(), st.integers(0, 9), st.integers(0, 6), st.sampled_from([1, 3, 512]))
+def test_a_log_restored_at_any_record_answers_and_hashes_as_the_one_that_went_on(data, passes, window, segment):
+    run = run_of(passes)
+    cut = data.draw(st.integers(1, len(run)))
+    # Some are sent again, some come too early, some are another record in the same place.
+    sent = [item for item in run[cut:] for _ in range(data.draw(st.integers(1, 2)))]
+    strays = data.draw(st.lists(st.tuples(st.integers(0, len(sent)), st.sampled_from(run), st.booleans())))
+    for at, stray, other in strays:
+        sent.insert(at, stray._replace(signals={"return": 0.5}) if other and hasattr(stray, "signals") else stray)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(knowledge.log, "SEGMENT", segment)
+        log, rows, told = fresh(window), rows_of((cut - 1) // 4), []
+        for record in run[:cut]:
+            log.append(record)
+        again = fresh(window)
+        again.on_rows(lambda segment: told.extend(segment["pass"].tolist()))
+        again.restore(plan(0), iter(rows), list(log.window), list(log.since(log.passes + 1)))
+        assert states(again) == states(log)
+        assert [again.append(record) for record in sent] == [log.append(record) for record in sent]
+        assert states(again) == states(log)
+        again.flush()
+    assert told == list(range(len(rows) + 1, again.passes + 1))
+
+
+def rows_of(passes):
+    log, rows = fresh(), []
+    for record in run_of(passes):
+        log.append(record)
+        rows.append(log.last_row())
+    return rows[4::4]  # after each plan but the first
+
+
+def test_a_log_before_plan_0_is_restored_as_a_fresh_one():
+    log = fresh()
+    log.restore(None, [], [], [])
+    assert log.sha256() == fresh().sha256()
+    assert log.append(plan(0)) is Ack.OK
+
+
+def test_a_log_is_restored_without_the_records_that_are_not_kept():
+    log = fresh()
+    log.restore(plan(0), rows_of(6), [one_pass(6)], [])
+    assert (log.sha256(), log.passes, list(log.window)) == (filled(6).sha256(), 6, [one_pass(6)])
+    log = fresh()
+    log.restore(plan(0), rows_of(6), [], [])
+    assert (log.sha256(), log.last_row()) == (filled(6).sha256(), rows_of(6)[-1])
+    assert log.append(one_pass(6)[0]) is Ack.DUPLICATE
+    assert log.append(one_pass(7)[0]) is Ack.OK
+
+
+@pytest.mark.parametrize(
+    ("start", "rows", "passes", "open_records", "why"),
+    [
+        (None, rows_of(1), [], [], "row 1 of the restored log is not the packed row of pass 1"),
+        (None, [], [], one_pass(1)[:1], "Observation 1 does not come next in the restored log: gap"),
+        (plan(0), rows_of(3)[1:], [], [], "row 1 .* is not the packed row of pass 1"),
+        (plan(0), [rows_of(1)[0][:-1]], [], [], "row 1 .* is not the packed row of pass 1"),
+        (plan(0), [*rows_of(2), b""], [], [], "row 3 .* is not the packed row of pass 3"),
+        (plan(0), rows_of(1), [one_pass(1), one_pass(2)], [], "2 finished passes were given with the rows of 1"),
+        (plan(0), rows_of(3), [one_pass(2)], [], "Observation 2 does not come next in the restored log: duplicate"),
+        (plan(0), rows_of(2), [one_pass(2, value=7.0)], [], "the records of pass 2 do not give its row"),
+        (plan(0), rows_of(2), [], one_pass(3)[1:], "Symptom 3 does not come next in the restored log: gap"),
+        (plan(1), [], [], [], "ChangePlan 1 does not come next in the restored log: gap"),
+    ],
+)
+def test_what_is_no_run_is_not_restored(start, rows, passes, open_records, why):
+    with pytest.raises(ValueError, match=why):
+        fresh().restore(start, rows, passes, open_records)
+
+
+def test_only_a_fresh_log_is_restored_into():
+    with pytest.raises(ValueError, match="a log of 2 passes cannot be restored into; make a fresh one"):
+        filled(2).restore(plan(0), [], [], [])
+
+
+def test_the_last_row_is_that_of_the_newest_finished_pass_whether_it_was_handed_on_or_not():
+    log = fresh()
+    with pytest.raises(LookupError, match="plan 0 makes the first"):
+        log.last_row()
+    log.append(plan(0))
+    assert log.last_row() == log.layout.pack_start(plan(0))
+    for record in one_pass(1):
+        log.append(record)
+    row = log.last_row()
+    assert np.frombuffer(row, log.layout.dtype)["pass"].tolist() == [1]
+    log.flush()
+    log.append(one_pass(2)[0])
+    assert log.last_row() == row

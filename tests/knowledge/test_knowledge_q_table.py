@@ -1,4 +1,5 @@
 import hashlib
+import json
 import struct
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knowledge import QTable
+from knowledge import MalformedRecord, QTable
 
 ids = st.lists(st.integers(0, 100), unique=True, min_size=1, max_size=6)
 
@@ -120,3 +121,143 @@ def test_the_hash_does_not_see_how_the_values_lie_in_memory(layout):
     before = made.sha256()
     made.values = layout(made.values)
     assert made.sha256() == before
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def tables(draw):
+    actions, n_states = draw(st.lists(st.integers(0, 2**63 - 1), unique=True, max_size=4)), draw(st.integers(1, 5))
+    made = QTable(actions, n_states)
+    for at in range(made.values.size):
+        made.values.flat[at] = draw(finite)
+    return made
+
+
+@given(tables())
+def test_a_table_comes_back_from_the_wire_bit_by_bit(made):
+    header, data = made.to_bytes()
+    again = QTable.from_bytes(json.loads(json.dumps(header)), data)
+    assert again.actions == made.actions
+    assert again.values.shape == made.values.shape
+    assert again.values.tobytes() == made.values.tobytes()  # the sign of zero too
+    again.values[:] = 1.0  # a table of one's own, which can be written
+    assert again.to_bytes() == again.copy().to_bytes()
+
+
+def test_the_wire_form_of_a_table_names_its_schema_shape_and_hash():
+    made = table()
+    header, data = made.to_bytes()
+    assert header == {
+        "schema": "QTable/1",
+        "actions": [3, 1, 7],
+        "shape": [3, 4],
+        "dtype": "<f8",
+        "sha256": made.sha256(),
+    }
+    assert data == struct.pack("<12d", *(i + 0.5 for i in range(12)))
+
+
+def test_the_wire_form_does_not_see_how_the_values_lie_in_memory():
+    made = table()
+    before = made.to_bytes()
+    made.values = np.asfortranarray(made.values)
+    assert made.to_bytes() == before
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_table_with_a_value_that_is_not_finite_is_neither_sent_nor_taken(bad):
+    made = table()
+    made.values[1, 2] = bad
+    with pytest.raises(MalformedRecord, match="not finite"):
+        made.to_bytes()
+    header = table().to_bytes()[0] | {"sha256": made.sha256()}
+    with pytest.raises(MalformedRecord, match="not finite"):
+        QTable.from_bytes(header, made.values.tobytes())
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"schema": "QTable/2"}, "with the schema QTable/1"),
+        ({"schema": ["QTable/1"]}, "with the schema QTable/1"),
+        ({"surprise": 1}, "and not .*surprise"),
+        ({"actions": [3, 1, True]}, "list of integers"),
+        ({"actions": [3, 1, 7.0]}, "list of integers"),
+        ({"actions": "317"}, "list of integers"),
+        ({"actions": [3, 1, 3]}, "distinct and not negative"),
+        ({"actions": [3, 1, -7]}, "distinct and not negative"),
+        ({"actions": [3, 1, 2**63]}, "QTable/1: "),
+        ({"actions": [3, 1]}, "2 actions and 96 bytes are no table of shape"),
+        ({"actions": [3, 1, 7, 8]}, "4 actions and 96 bytes are no table of shape"),
+        ({"actions": [1, 3, 7]}, "the hash of the table is"),
+        ({"shape": [3, 4, 1]}, "list of integers, and shape one of two"),
+        ({"shape": [3, 4.0]}, "list of integers, and shape one of two"),
+        ({"shape": [True, 4]}, "list of integers, and shape one of two"),
+        ({"shape": [3, 10**30]}, "no table of shape"),
+        ({"shape": [3, -4]}, "no table of shape"),
+        ({"shape": [4, 3]}, "no table of shape"),
+        ({"dtype": ">f8"}, "and dtype <f8"),
+        ({"dtype": "<f4"}, "and dtype <f8"),
+        ({"sha256": "0" * 64}, "the hash of the table is"),
+        ({"sha256": None}, "the hash of the table is"),
+    ],
+)
+def test_a_header_that_is_wrong_in_one_place_is_refused_with_the_reason(changes, why):
+    header, data = table().to_bytes()
+    with pytest.raises(MalformedRecord, match=why):
+        QTable.from_bytes(header | changes, data)
+
+
+@pytest.mark.parametrize("name", ["schema", "actions", "shape", "dtype", "sha256"])
+def test_a_header_with_a_missing_key_is_refused(name):
+    header, data = table().to_bytes()
+    del header[name]
+    with pytest.raises(MalformedRecord, match="QTable/1"):
+        QTable.from_bytes(header, data)
+
+
+@pytest.mark.parametrize("states", [0, -1, 2**62, 10**30])
+def test_a_table_without_rows_still_has_states_that_can_be(states):
+    header, data = QTable((), 3).to_bytes()
+    with pytest.raises(MalformedRecord, match="QTable/1: "):
+        QTable.from_bytes(header | {"shape": [0, states]}, data)
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@given(tables(), st.data())
+def test_a_damaged_table_is_refused_and_never_taken(made, data):
+    header, values = made.to_bytes()
+    names = st.sampled_from(sorted(header)) | st.text(max_size=8)
+    changes = data.draw(st.dictionaries(names, json_values, max_size=2))
+    damaged = bytearray(values)
+    if damaged and data.draw(st.booleans()):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(0, 255))
+    for name in data.draw(st.sets(st.sampled_from(sorted(header)), max_size=1)):
+        header.pop(name)
+    try:
+        again = QTable.from_bytes(header | changes, bytes(damaged))
+    except MalformedRecord:
+        return
+    assert again.to_bytes() == made.to_bytes()
+
+
+@given(json_values, st.binary(max_size=64))
+def test_what_is_no_header_is_refused(header, data):
+    with pytest.raises(MalformedRecord):
+        QTable.from_bytes(header, data)
+
+
+@given(tables(), st.binary(max_size=64))
+def test_other_bytes_under_a_header_are_refused(made, data):
+    header, values = made.to_bytes()
+    if data != values:
+        with pytest.raises(MalformedRecord):
+            QTable.from_bytes(header, data)
