@@ -9,8 +9,6 @@ merged.
 from __future__ import annotations
 
 import json
-import sysconfig
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,9 +17,9 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from mape import registry
 from mape.errors import ConfigError, UnknownName
+from mape.parts import owner, parts_in, place_of, with_part
 from mape.specs import PartConfig, PartSpec, explain
-
-Table = dict[str, Any]
+from mape.tables import merge, parse_override, read_table
 
 
 class DetectorSpec(PartSpec):
@@ -88,6 +86,9 @@ class SystemConfig(PartConfig):
     )
     max_actions: int = Field(64, ge=1, le=4096, description="largest number of actions that the records can hold")
     discretise: BoxGrid | None = None
+    redrivable: bool | None = Field(
+        None, description="whether an episode can be driven again after others; by default as the system says, or true"
+    )
 
 
 class MonitorConfig(PartConfig):
@@ -101,6 +102,9 @@ class ExecuteConfig(PartConfig):
 
     engine: str = "auto"
     mask_greedy: bool = False
+    mode: str = Field("lockstep", description="lockstep: an episode waits for its plan; free: it never does")
+    rate: float | None = Field(None, gt=0, description="episodes per second of a free-running system")
+    backlog: int = Field(1000, ge=1, description="observations that a free-running system holds back before it drops")
 
     @field_validator("engine")
     @classmethod
@@ -108,6 +112,43 @@ class ExecuteConfig(PartConfig):
         if engine not in ("auto", "compiled", "python"):
             raise ValueError(f"engine {engine!r} is not one of auto, compiled, python")
         return engine
+
+    @field_validator("mode")
+    @classmethod
+    def _either(cls, mode: str) -> str:
+        if mode not in ("lockstep", "free"):
+            raise ValueError(f"mode {mode!r} is not one of lockstep, free")
+        return mode
+
+    @model_validator(mode="after")
+    def _paced(self) -> ExecuteConfig:
+        if self.mode == "free" and self.rate is None:
+            raise ValueError(
+                "mode 'free' needs a rate: the system is paced by it, in episodes per second, such as rate = 10.0"
+            )
+        if self.mode == "lockstep" and self.rate is not None:
+            raise ValueError(
+                f"rate = {self.rate} paces a free-running system; in lockstep each episode waits for its plan, and "
+                "nothing else sets the pace. Leave rate out, or choose mode = 'free'"
+            )
+        return self
+
+
+class SwapConfig(PartConfig):
+    """A part that is replaced in the running loop, between two passes."""
+
+    pass_no: int = Field(alias="pass", ge=1, description="first pass that the new part serves")
+    part: str = Field(description="monitor, monitor.K, analyze, plan, plan.schedule or learner")
+    to: PartSpec
+
+    @field_validator("part")
+    @classmethod
+    def _known(cls, part: str) -> str:
+        try:
+            owner(part)
+        except UnknownName as error:
+            raise ValueError(str(error)) from None
+        return part
 
 
 class Config(PartConfig):
@@ -124,10 +165,51 @@ class Config(PartConfig):
     analyze: AnalyzerSpec = AnalyzerSpec()
     plan: PlannerSpec = PlannerSpec()
     execute: ExecuteConfig = ExecuteConfig()
+    loops: int = Field(1, ge=1, le=4096, description="loops of each trial, every one over a system of its own")
+    swap: tuple[SwapConfig, ...] = Field((), description="parts that are replaced on the way, in order of pass")
+
+    @field_validator("swap")
+    @classmethod
+    def _in_order(cls, swaps: tuple[SwapConfig, ...]) -> tuple[SwapConfig, ...]:
+        return tuple(sorted(swaps, key=lambda swap: swap.pass_no))
+
+    @model_validator(mode="after")
+    def _swappable(self) -> Config:
+        made: set[tuple[int, str]] = set()
+        for swap in self.swap:
+            if swap.pass_no > self.episodes:
+                raise ValueError(
+                    f"a swap of {swap.part} at pass {swap.pass_no} is never made in a run of {self.episodes} episodes"
+                )
+            try:
+                place = place_of(swap.part, self)
+            except UnknownName as error:
+                raise ValueError(f"swap at pass {swap.pass_no}: {error}") from None
+            if (swap.pass_no, place) in made:
+                raise ValueError(f"two swaps of {swap.part} at pass {swap.pass_no}; leave one of them")
+            made.add((swap.pass_no, place))
+        return self
+
+    @property
+    def units(self) -> int:
+        """Number of independent units of work: each loop of each trial."""
+        return self.trials * self.loops
+
+    def unit(self, trial: int, loop: int) -> int:
+        """Return the number of a unit, from 0: the number of the loop in the records.
+
+        Raises
+        ------
+        ConfigError
+            The config has no such loop.
+        """
+        if not 0 <= loop < self.loops:
+            raise ConfigError(f"loop {loop} is not one of the {self.loops} loops of a trial, which count from 0")
+        return trial * self.loops + loop
 
     def to_json(self) -> str:
         """Write the config as JSON, from which `from_table` makes it again."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return json.dumps(self.model_dump(mode="json", by_alias=True), sort_keys=True)
 
 
 def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
@@ -149,13 +231,27 @@ def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
 
 
 def parts_of(config: Config) -> Iterable[tuple[str, str, PartSpec]]:
-    """Yield kind, path and spec of every part that a config names."""
+    """Yield kind, path and spec of every part that a config names, those of its swaps as they will stand among them.
+
+    Raises
+    ------
+    ConfigError
+        What a swap names is no part of its kind.
+    """
     yield "learner", "learner", config.learner
     for i, detector in enumerate(config.monitor.detectors):
         yield "detector", f"monitor.detectors[{i}]", detector
     yield "analyzer", "analyze", config.analyze
     yield "planner", "plan", config.plan
     yield "schedule", "plan.schedule", config.plan.schedule
+    after = config
+    for swap in config.swap:
+        path = f"swap(pass {swap.pass_no}).to"
+        after = with_part(after, swap.part, swap.to)
+        kind, spec = parts_in(after)[swap.part]
+        yield kind, path, spec
+        if isinstance(spec, PlannerSpec):
+            yield "schedule", f"{path}.schedule", spec.schedule
 
 
 def load(
@@ -191,81 +287,6 @@ def load(
 def overlays_of(path: str | Path, kind: str) -> list[str]:
     """Return the names of a file's profiles or agents, in its order."""
     return list(read_table(path).get(f"{kind}s", {}))
-
-
-def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
-    """Read a TOML or JSON file and what it extends."""
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except FileNotFoundError:
-        raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in {_examples()}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
-        kind = "JSON" if path.suffix == ".json" else "TOML"
-        raise ConfigError(f"{path} is not valid {kind}: {error}") from None
-    if not isinstance(table, dict):
-        raise ConfigError(f"{path} holds no table")
-    base = table.pop("extends", None)
-    if base is None:
-        return table
-    if not isinstance(base, str):
-        raise ConfigError(f"{path}: extends = {base!r} is not the path of another config file")
-    if path.resolve() in _seen:
-        raise ConfigError(f"{path} extends itself, by way of {' -> '.join(p.name for p in _seen)}")
-    below = read_table(path.parent / base, (*_seen, path.resolve()))
-    # What a file adds to another stands for itself: the other's overlays are not its own.
-    below.pop("agents", None)
-    below.pop("profiles", None)
-    return merge(below, table)
-
-
-def _examples() -> str:
-    installed = Path(sysconfig.get_path("data"), "share", "mapek", "examples")
-    return str(installed) if installed.is_dir() else "the folder examples of the project"
-
-
-def merge(base: Table, over: Table) -> Table:
-    """Lay one table over another; see the module.
-
-    >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": {"k": 6}})
-    {'plan': {'name': 'morphin', 'k': 6}}
-    >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": "q_learning"})
-    {'plan': 'q_learning'}
-    """
-    return base | {key: _lay(base[key], value) if key in base else value for key, value in over.items()}
-
-
-def _lay(base: Any, over: Any) -> Any:
-    if isinstance(base, str) and isinstance(over, dict):
-        base = {"name": base}
-    if not isinstance(base, dict) or not isinstance(over, dict):
-        return over
-    if any(key in base and key in over and base[key] != over[key] for key in ("name", "id")):
-        return over  # another part or system: the options of the one before mean nothing to it
-    return merge(base, over)
-
-
-def parse_override(text: str) -> Table:
-    """Read ``a.b=VALUE``; VALUE is TOML, or else a string.
-
-    >>> parse_override("plan.alpha=0.2"), parse_override("plan=q_learning")
-    ({'plan': {'alpha': 0.2}}, {'plan': 'q_learning'})
-    """
-    key, equals, text_value = text.partition("=")
-    path = key.strip().split(".")
-    if not equals or not all(path):
-        raise ConfigError(f"--set {text!r} is not KEY=VALUE with a dotted key, such as plan.alpha=0.2")
-    try:
-        value = tomllib.loads(f"value = {text_value.strip()}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text_value.strip()
-    for part in reversed(path):
-        value = {part: value}
-    table: Table = value
-    return table
 
 
 def _refuse(value: Any, where: str) -> Any:

@@ -9,20 +9,22 @@ Observation -> Monitor -> Symptom -> Analyze -> ChangeRequest -> Plan -> ChangeP
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, Record, RowLayout, Symptom
-from mape import registry
 from mape.analyze import Analyze
 from mape.bus import LocalBus
-from mape.config import Config
+from mape.config import Config, SwapConfig
 from mape.errors import ConfigError
 from mape.execute import Execute
 from mape.execute.component import SIGNALS
 from mape.monitor import Monitor
+from mape.parts import make
 from mape.plan import Plan
 from mape.ports import ManagedSystem
+from mape.swap import Component, owner, replace_part
 
 Send = Callable[[Any], object]
 
@@ -41,24 +43,23 @@ def layout_of(config: Config, system: ManagedSystem) -> RowLayout:
             raise ConfigError(
                 f"detector {detector.name!r} watches signal {detector.signal!r}; {system.name} has {', '.join(signals)}"
             )
-    learner = registry.build("learner", config.learner)
+    learner = make("learner", config.learner)
     return RowLayout(signals, len(config.monitor.detectors), len(learner.rate_names), config.system.max_actions)
 
 
 def build_monitor(config: Config, send: Send) -> Monitor:
     """Make the Monitor that a config describes."""
-    return Monitor([(spec.signal, registry.build("detector", spec)) for spec in config.monitor.detectors], send)
+    return Monitor([(spec.signal, make("detector", spec)) for spec in config.monitor.detectors], send)
 
 
 def build_analyze(config: Config, send: Send) -> Analyze:
     """Make the Analyze that a config describes."""
-    return Analyze(registry.build("analyzer", config.analyze), send)
+    return Analyze(make("analyzer", config.analyze), send)
 
 
 def build_plan(config: Config, knowledge: Knowledge, send: Send) -> Plan:
     """Make the Plan that a config describes."""
-    schedule = registry.build("schedule", config.plan.schedule)
-    return Plan(registry.build("planner", config.plan, schedule=schedule), knowledge, send)
+    return Plan(make("planner", config.plan), knowledge, send)
 
 
 def build_execute(
@@ -67,7 +68,7 @@ def build_execute(
     """Make the Execute that a config describes, over a fresh system."""
     return Execute(
         system,
-        registry.build("learner", config.learner),
+        make("learner", config.learner),
         knowledge,
         send,
         seed=config.seed,
@@ -89,7 +90,12 @@ class Loop:
     system
         The managed system, fresh.
     trial, loop
-        Which stream of randomness is used.
+        Which stream of randomness is used; the number of this unit of work (`Config.unit`) stands in the records.
+
+    Raises
+    ------
+    ConfigError
+        The config is of a free-running system, or a part cannot be made.
 
     Examples
     --------
@@ -103,9 +109,14 @@ class Loop:
     """
 
     def __init__(self, config: Config, system: ManagedSystem, trial: int = 0, loop: int = 0) -> None:
+        if config.execute.mode == "free":
+            raise ConfigError(
+                "free-running needs processes: mapek up. In one process each episode waits for its plan "
+                "(execute.mode = 'lockstep')."
+            )
         self.config = config
         self.system = system
-        self.log = Log(layout_of(config, system), loop)
+        self.log = Log(layout_of(config, system), config.unit(trial, loop))
         self.knowledge = Knowledge(self.log)
         self.bus = LocalBus(self.log)
         send = self.bus.send
@@ -117,6 +128,27 @@ class Loop:
         self.bus.subscribe(Symptom, self.analyze.on_symptom)
         self.bus.subscribe(ChangeRequest, self.plan.on_request)
         self.bus.subscribe(ChangePlan, self.execute.adopt)
+        self._swaps = deque(config.swap)  # those that are still to be made
+        self._told: list[Callable[[SwapConfig, bool], object]] = []
+
+    def on_swap(self, listener: Callable[[SwapConfig, bool], object]) -> None:
+        """Tell `listener` of each swap that is made, and whether the new part took over the old one's state."""
+        self._told.append(listener)
+
+    def swap(self) -> None:
+        """Make the next swap of the config, between two passes; `run` and `advance` do so when its pass has come.
+
+        Raises
+        ------
+        ConfigError, PartError
+            The new part cannot be let in. The old one goes on, and the swap is still to be made.
+        """
+        swap = self._swaps[0]
+        component: Component = getattr(self, owner(swap.part))
+        handed_over = replace_part(component, swap.part, swap.to, self.config, signals=self.log.layout.signals)
+        self._swaps.popleft()
+        for tell in self._told:
+            tell(swap, handed_over)
 
     def advance(self) -> Record:
         """Move by one record, and return it: the next that waits, or the Observation of a new episode."""
@@ -125,6 +157,7 @@ class Loop:
             if self.execute.plan is None:
                 self.plan.start(self.log.loop)
             else:
+                self._swap_before(self.execute.passes + 1)
                 self.execute.drive()
             record = self.bus.deliver()
         assert record is not None
@@ -138,10 +171,18 @@ class Loop:
         PartError, ManagedSystemError
             What a part or the system raised; the passes before it are logged.
         """
-        drive, settle = self.execute.drive, self.bus.run
-        if self.execute.plan is None and self.knowledge.plan is None:
+        execute, drive, settle = self.execute, self.execute.drive, self.bus.run
+        if execute.plan is None and self.knowledge.plan is None:
             self.plan.start(self.log.loop)
         settle()
-        for _ in range(passes):
-            drive()
-            settle()
+        last = execute.passes + passes
+        while execute.passes < last:
+            self._swap_before(execute.passes + 1)
+            until = min(last, self._swaps[0].pass_no - 1) if self._swaps else last
+            for _ in range(execute.passes, until):
+                drive()
+                settle()
+
+    def _swap_before(self, number: int) -> None:
+        while self._swaps and self._swaps[0].pass_no <= number:
+            self.swap()

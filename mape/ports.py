@@ -1,6 +1,10 @@
 """Every contract of the loop on one screen.
 
 A part is any object with these members; nothing is inherited. `mape.testing` checks them.
+
+A detector, analyzer, schedule or planner may also have `state_format`, a name such as ``"page_hinkley/1"`` of what its
+`state` gives: a part that takes its place in a running loop and has the same one takes over its state. A planner that
+keeps its schedule in an attribute `schedule`, and asks it anew at each plan, can be given another one.
 """
 
 from __future__ import annotations
@@ -115,6 +119,7 @@ class ManagedSystem(Protocol):
     signal_names: tuple[str, ...]
     drifts: tuple[int, ...]  # episodes from which a new regime holds, where known; for evaluation only
     draws: tuple[int, int]  # uniforms that a reset and a step take from the pass's block
+    redrivable: bool  # whether an episode can be driven again after others; not so for a plant, or another's process
     rules: StepRules | None
 
     def available(self, episode: int) -> tuple[int, ...] | None:
@@ -135,6 +140,14 @@ class ManagedSystem(Protocol):
 
     def enable(self, actions: tuple[int, ...]) -> None:
         """Switch reserve actions on, from the next episode."""
+        ...
+
+    def get_state(self) -> Json:
+        """Return what is carried from one episode to the next; None where that is nothing, or is not said."""
+        ...
+
+    def set_state(self, state: Json) -> None:
+        """Go on from what `get_state` gave, here or elsewhere."""
         ...
 
     def close(self) -> None:

@@ -54,10 +54,12 @@ def explain(error: ValidationError, prefix: str, model: type[BaseModel]) -> str:
 
 def _fields_at(model: Any, loc: tuple[Any, ...]) -> list[str]:
     for part in loc:
+        if isinstance(part, int):
+            continue  # of a list of models the model stays
         fields = getattr(model, "model_fields", {})
-        if isinstance(part, int) or part not in fields:
+        if part not in fields:
             return []
         annotation = fields[part].annotation
         kinds = [annotation, *getattr(annotation, "__args__", ())]
         model = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-    return list(getattr(model, "model_fields", {}))
+    return [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]

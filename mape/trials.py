@@ -19,7 +19,11 @@ RowListener = Callable[[npt.NDArray[np.void]], object]
 
 
 class TrialResult(NamedTuple):
-    """What one trial came to; `alarms` are the episodes at whose end a detector alarmed."""
+    """What one trial came to, or one loop of it.
+
+    `alarms` are the episodes at whose end a detector alarmed; `handed_over` says of each swap that was made whether
+    the new part took over the state of the old one.
+    """
 
     trial: int
     passes: int
@@ -27,6 +31,8 @@ class TrialResult(NamedTuple):
     alarms: tuple[int, ...]
     log_sha256: str
     q_table_sha256: str
+    loop: int = 0
+    handed_over: tuple[bool, ...] = ()
 
 
 def run_trial(
@@ -34,17 +40,20 @@ def run_trial(
     trial: int,
     make_system: Callable[[SystemConfig], ManagedSystem],
     *,
+    loop: int = 0,
     on_rows: RowListener | None = None,
     prepare: Callable[[Loop], object] | None = None,
 ) -> TrialResult:
-    """Run one trial from its first episode to its last.
+    """Run one loop of one trial from its first episode to its last.
 
     Parameters
     ----------
     config, trial
-        What runs, and the number of the trial; with the config's seed it fixes all randomness.
+        What runs, and the number of the trial.
     make_system
         Gives a fresh managed system.
+    loop
+        Which of the trial's loops; with the trial and the config's seed it fixes all randomness.
     on_rows
         Gets the log's rows, segment by segment, so that memory does not grow with the number of episodes.
     prepare
@@ -57,52 +66,62 @@ def run_trial(
     """
     system = make_system(config.system)
     try:
-        loop = Loop(config, system, trial)
+        running = Loop(config, system, trial, loop)
         steps = 0
         alarms: list[int] = []
+        handed_over: list[bool] = []
 
         def count(rows: npt.NDArray[np.void]) -> None:
             nonlocal steps
             steps += int(rows["steps"].sum())
             alarms.extend(rows["pass"][rows["alarm"].any(axis=1)].tolist())
 
-        loop.log.on_rows(count)
+        running.log.on_rows(count)
+        running.on_swap(lambda swap, kept: handed_over.append(kept))
         if on_rows is not None:
-            loop.log.on_rows(on_rows)
+            running.log.on_rows(on_rows)
         if prepare is not None:
-            prepare(loop)
+            prepare(running)
         try:
-            loop.run(config.episodes)
+            running.run(config.episodes)
         finally:
-            loop.log.flush()  # what is finished is heard of, whatever happened then
+            running.log.flush()  # what is finished is heard of, whatever happened then
         return TrialResult(
-            trial, loop.log.passes, steps, tuple(alarms), loop.log.sha256(), loop.execute.q_table.sha256()
+            trial,
+            running.log.passes,
+            steps,
+            tuple(alarms),
+            running.log.sha256(),
+            running.execute.q_table.sha256(),
+            loop,
+            tuple(handed_over),
         )
     except MapekError as error:
-        if config.trials > 1 and not str(error).startswith("trial "):
-            error.args = (f"trial {trial}: {error}",)
+        if config.units > 1 and not str(error).startswith("trial "):
+            told = f"trial {trial}" if config.loops == 1 else f"trial {trial}, loop {loop}"
+            error.args = (f"{told}: {error}",)
         raise
     finally:
         system.close()
 
 
 def combined_hash(hashes: Iterable[str]) -> str:
-    """Hash the hashes of all trials, in the order of their numbers."""
+    """Hash the hashes of all units, the loops of all trials, in the order of their numbers."""
     return hashlib.sha256("".join(hashes).encode()).hexdigest()
 
 
-def chunks(trials: Sequence[int], size: int) -> list[tuple[int, int]]:
-    """Cut trial numbers, increasing, into runs of neighbours of at most `size`: (first, count).
+def chunks(units: Sequence[int], size: int) -> list[tuple[int, int]]:
+    """Cut numbers of units, increasing, into runs of neighbours of at most `size`: (first, count).
 
     >>> chunks([0, 1, 2, 5, 6], 2)
     [(0, 2), (2, 1), (5, 2)]
     """
     found: list[tuple[int, int]] = []
-    for trial in trials:
-        if found and found[-1][0] + found[-1][1] == trial and found[-1][1] < size:
+    for unit in units:
+        if found and found[-1][0] + found[-1][1] == unit and found[-1][1] < size:
             found[-1] = (found[-1][0], found[-1][1] + 1)
         else:
-            found.append((trial, 1))
+            found.append((unit, 1))
     return found
 
 

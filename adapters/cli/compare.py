@@ -82,11 +82,11 @@ def _configs(chosen: argparse.Namespace) -> dict[str, Config]:
             f"compare needs two things to compare, and found {next(iter(found))!r} alone. Give several configs, or one "
             "with [agents.NAME] tables, all of which are compared unless --agents names some."
         )
-    for what in ("seed", "trials", "episodes"):
+    for what in ("seed", "trials", "loops", "episodes"):
         values = {label: getattr(config, what) for label, config in found.items()}
         if len(set(values.values())) > 1:
             given = ", ".join(f"{label} {value}" for label, value in values.items())
-            hint = f"--{what} N" if what != "episodes" else "--set episodes=N"
+            hint = f"--{what} N" if what in ("seed", "trials") else f"--set {what}=N"
             named = what if what == "seed" else f"number of {what}"
             raise ConfigError(f"a fair comparison has one {named} for all: {given}. Give {hint}.")
     return found
@@ -101,9 +101,11 @@ def _print(
     corrected: list[float | None],
 ) -> None:
     some = configs[first]
+    loops = f" with {some.loops:,} loops" if some.loops > 1 else ""
     say(
         chosen,
-        f"{len(rows)} agents, {some.trials:,} trials of {some.episodes:,} episodes each, seeds from {some.seed}\n",
+        f"{len(rows)} agents, {some.trials:,} trials{loops} of {some.episodes:,} episodes each, seeds from "
+        f"{some.seed}\n",
     )
     width = max(len(agent) for agent in rows)
     say(chosen, f"{'':<{width}}{'total return':>26}{'95 % interval':>26}{'total steps':>22}{'alarms':>9}")
@@ -114,7 +116,8 @@ def _print(
             chosen,
             f"{agent:<{width}}{_with_sd(total):>26}{interval:>26}{_with_sd(steps):>22}{row['alarms']:>9.2f}",
         )
-    say(chosen, f"\nagainst {first}, total return, paired by trial")
+    unit = "trial" if some.loops == 1 else "loop of a trial"
+    say(chosen, f"\nagainst {first}, total return, paired by {unit}")
     titles = f"{'difference':>14}{'95 % interval':>24}{'effect size':>13}{'Welch t':>10}{'paired p (Holm)':>17}"
     say(chosen, f"{'':<{width}}{titles}")
     for (agent, found), p in zip(against.items(), corrected, strict=True):
@@ -126,7 +129,8 @@ def _print(
     say(
         chosen,
         "\nAll agents run on the same seeds: interval, effect size (mean / sd of the differences) and paired t test"
-        "\nrest on the differences within trials. Welch's t takes the samples as independent.",
+        f"\nrest on the differences within {unit if some.loops > 1 else 'trials'}. Welch's t takes the samples as "
+        "independent.",
     )
 
 

@@ -25,6 +25,7 @@ from adapters.experiments.statistics import Comparison, compare, summary
 from adapters.results import RunFolder
 from adapters.systems import make_system
 from mape.config import Config
+from mape.errors import ConfigError
 from mape.trials import TrialResult, combined_hash
 
 Results = dict[str, list[TrialResult]]
@@ -37,6 +38,12 @@ def execute(chosen: argparse.Namespace) -> int:
     path = experiment_config(file)
     profile = chosen.profile or profile
     configs = {agent: config_of(path, chosen, agent, trials=trials, profile=profile) for agent in agents}
+    for config in configs.values():
+        if config.loops > 1:
+            raise ConfigError(
+                f"reproduce counts independent trials, as the paper does, and loops = {config.loops} would count each "
+                "trial several times; leave loops out, and give --trials N for more"
+            )
     traced = None if chosen.no_figures or trace is None else (1, configs[agents[0]].episodes)
     with open_folder(chosen, f"reproduce {chosen.experiment}", chosen.experiment, configs, traced) as folder:
         results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet)

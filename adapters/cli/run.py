@@ -1,4 +1,4 @@
-"""`mapek run`: one config, one agent, any number of trials."""
+"""`mapek run`: one config, one agent, any number of trials, each of one or several loops."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from knowledge import STAGES, Record
 from mape.config import Config
 from mape.errors import ConfigError
 from mape.loop import Loop
+from mape.swap import swap_sentence
 from mape.trials import TrialResult, combined_hash
 
 
@@ -33,7 +34,7 @@ def execute(chosen: argparse.Namespace) -> int:
             {label: config}, folder, workers=chosen.workers, trace=chosen.trace, quiet=chosen.quiet, prepare=watch
         )[label]
         result = as_json(config, results)
-        _report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
+        report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
         figures = []
         if not chosen.no_figures:
             from adapters.experiments.pictures import pictures_of_run
@@ -44,46 +45,60 @@ def execute(chosen: argparse.Namespace) -> int:
 
 
 def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
-    """Return what `run --json` writes."""
+    """Return what `run --json` writes: every unit, the loops of trial 0 first; its loop where a trial has several."""
+    swaps = [
+        {"pass": swap.pass_no, "part": swap.part, "to": swap.to.model_dump(mode="json"), "handed_over": kept}
+        for swap, kept in zip(config.swap, results[0].handed_over, strict=True)
+    ]
     return {
         "name": config.name,
         "passes": config.episodes,
         "seed": config.seed,
+        **({"loops": config.loops} if config.loops > 1 else {}),
+        **({"swaps": swaps} if swaps else {}),
         "trials": [
             {
                 "trial": r.trial,
+                **({"loop": r.loop} if config.loops > 1 else {}),
                 "alarms": list(r.alarms),
                 "total_steps": r.total_steps,
-                "log_sha256": r.log_sha256,
+                "log_sha256": r.log_sha256 or None,
                 "q_table_sha256": r.q_table_sha256,
             }
             for r in results
         ],
-        "log_sha256": combined_hash(r.log_sha256 for r in results),
+        "log_sha256": None if config.execute.mode == "free" else combined_hash(r.log_sha256 for r in results),
         "q_table_sha256": combined_hash(r.q_table_sha256 for r in results),
     }
 
 
-def _report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], last: npt.NDArray[Any]) -> None:
-    """Print what came out; `last` are the returns of the last episodes of each trial."""
+def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], last: npt.NDArray[Any]) -> None:
+    """Print what came out; `last` are the returns of the last episodes of each unit."""
     steps = summary(np.array([r.total_steps for r in results]))
     late = summary(last.mean(axis=1))
     say(chosen, f"{config.name}: {config.description or config.system.id}")
     say(chosen, f"system:   {config.system.id}")
-    say(chosen, f"episodes: {config.episodes:,}, trials: {config.trials:,}, seed: {config.seed}")
+    loops = f", loops of each: {config.loops:,}" if config.loops > 1 else ""
+    say(chosen, f"episodes: {config.episodes:,}, trials: {config.trials:,}{loops}, seed: {config.seed}")
+    for swap, handed_over in zip(config.swap, results[0].handed_over, strict=True):
+        say(chosen, swap_sentence(swap, handed_over))
     say(chosen, f"steps:    {_with_sd(steps)} in total")
     say(chosen, f"return:   {_with_sd(late)}, mean of the last {last.shape[1]} episodes")
-    if config.trials == 1:
+    unit, units = ("trial", "trials") if config.loops == 1 else ("loop", "loops of all trials")
+    if config.units == 1:
         alarms = ", ".join(map(str, results[0].alarms)) or "none"
         say(chosen, f"alarms:   {alarms}" + (" (episodes)" if results[0].alarms else ""))
     else:
-        say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per trial")
-    if config.trials == 1:
+        say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per {unit}")
+    if config.execute.mode == "free":
+        say(chosen, "log:      no hash, as no free-running loop is the same twice")
+        say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)}")
+    elif config.units == 1:
         say(chosen, f"log:      {results[0].log_sha256}")
         say(chosen, f"Q-table:  {results[0].q_table_sha256}")
     else:
-        say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)} (of all trials)")
-        say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)} (of all trials)")
+        say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)} (of all {units})")
+        say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)} (of all {units})")
 
 
 def _with_sd(found: Any) -> str:
@@ -98,7 +113,7 @@ def _shower(chosen: argparse.Namespace, first: int, last: int) -> Any:
             say(chosen, sentence(record))
 
     def watch(loop: Loop) -> None:
-        if loop.execute.trial == 0:
+        if loop.log.loop == 0:  # unit 0: the first loop of trial 0
             for kind in STAGES:
                 loop.bus.subscribe(kind, show)
 

@@ -11,6 +11,7 @@ from adapters.systems import make_system
 from knowledge import ChangePlan, Observation
 from mape.errors import ConfigError
 from mape.loop import Loop
+from mape.swap import swap_sentence
 
 HELP = "Enter: next record; a number: run to that pass; q: leave"
 
@@ -22,6 +23,7 @@ def execute(chosen: argparse.Namespace) -> int:
     if chosen.first > config.episodes:
         raise ConfigError(f"--from {chosen.first} goes beyond the run's {config.episodes} episodes")
     loop = Loop(config, make_system(config.system))
+    loop.on_swap(lambda swap, handed_over: print(swap_sentence(swap, handed_over)))
     try:
         print(f"{config.name}, trial 0, seed {config.seed}. {HELP}.")
         if chosen.first > 1:

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -66,13 +66,13 @@ def run_agents(
     workers
         Processes; None for one per core. One trial, or one worker, runs in this process.
     trace
-        Episodes of trial 0 whose steps are kept.
+        Episodes of unit 0, the first loop of trial 0, whose steps are kept.
     prepare
         Called with each loop before its first pass; then everything runs in this process.
 
     Returns
     -------
-    agent -> results in the order of the trials
+    agent -> results in the order of the units: the loops of trial 0, then those of trial 1, and so on
 
     Raises
     ------
@@ -85,10 +85,10 @@ def run_agents(
     tasks: list[Task] = []
     for agent, config in configs.items():
         checked = check(config)
-        missing = [trial for trial in range(config.trials) if trial not in finished[agent]]
+        missing = [unit for unit in range(config.units) if unit not in finished[agent]]
         for first, count in chunks(missing, chunk_size(config, checked)):
             tasks.append((config.to_json(), first, count, folder.chunk_stem(agent, first, count), trace))
-    total = sum(config.trials * config.episodes for config in configs.values())
+    total = sum(config.units * config.episodes for config in configs.values())
     done = sum(len(finished[agent]) * config.episodes for agent, config in configs.items())
     workers = min(workers or os.cpu_count() or 1, len(tasks))
     with tqdm(
@@ -103,15 +103,16 @@ def run_agents(
                     run_chunk(*task, on_rows=lambda rows: bar.update(len(rows)), prepare=prepare)
         except KeyboardInterrupt:
             kept = sum(len(folder.finished(agent)) for agent in configs)
-            wanted = sum(config.trials for config in configs.values())
+            wanted = sum(config.units for config in configs.values())
+            units = "trials" if all(config.loops == 1 for config in configs.values()) else "loops of trials"
             raise Stopped(
-                f"stopped. {kept} of {wanted} trials are finished and kept in {folder.path}; "
+                f"stopped. {kept} of {wanted} {units} are finished and kept in {folder.path}; "
                 f"the same command with --out {folder.path} continues."
             ) from None
     results = {agent: folder.finished(agent) for agent in configs}
     for agent in configs:
         folder.assemble(agent)
-    return {agent: [found[trial] for trial in sorted(found)] for agent, found in results.items()}
+    return {agent: [found[unit] for unit in sorted(found)] for agent, found in results.items()}
 
 
 def chunk_size(config: Config, checked: Checked) -> int:
@@ -123,7 +124,7 @@ def chunk_size(config: Config, checked: Checked) -> int:
 
 
 def check(config: Config) -> Checked:
-    """Make all that a config names, once, and say what that tells about the cost of a trial.
+    """Make all that a config names, what it is to swap among it, and say what that tells about the cost of a trial.
 
     In this process first: what is wrong with a config is said at once, and the compiled code is in the cache before
     several workers want it.
@@ -135,8 +136,10 @@ def check(config: Config) -> Checked:
     """
     system = make_system(config.system)
     try:
-        execute = Loop(config, system).execute
-        return Checked(execute.compiled, execute.q_table.values.nbytes)
+        loop = Loop(config, system)
+        for _ in config.swap:
+            loop.swap()
+        return Checked(loop.execute.compiled, loop.execute.q_table.values.nbytes)
     finally:
         system.close()
 
@@ -144,7 +147,7 @@ def check(config: Config) -> Checked:
 def _run_in_workers(tasks: list[Task], workers: int, bar: Any) -> None:
     # Spawn, never fork: a forked process inherits threads' locks.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
+    with _Pool(workers, mp_context=context, initializer=_start_worker) as pool:
         try:
             for results in each_completed(pool, run_chunk, tasks, in_flight=2 * workers):
                 bar.update(sum(result.passes for result in results))
@@ -155,9 +158,21 @@ def _run_in_workers(tasks: list[Task], workers: int, bar: Any) -> None:
             ) from None
 
 
+class _Pool(ProcessPoolExecutor):
+    """Starts its workers deaf to Ctrl-C, which would come to them as a traceback before they can decline it."""
+
+    def submit(self, *arguments: Any, **options: Any) -> Future[Any]:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            return super().submit(*arguments, **options)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start_worker() -> None:
     # Ctrl-C reaches the whole process group; the parent alone decides, and lets running chunks end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     # A parent that is killed can end nobody: the workers would wait for it for ever.
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 

@@ -1,4 +1,4 @@
-"""The work of one worker: some trials of one agent, with their results on disk."""
+"""The work of one worker: some trials of one agent, or loops of trials, with their results on disk."""
 
 from __future__ import annotations
 
@@ -33,38 +33,41 @@ def run_chunk(
     on_rows: Any = None,
     prepare: Any = None,
 ) -> list[TrialResult]:
-    """Run `count` trials from number `first` and write ``STEM.rows``, ``STEM.npz`` and, last, ``STEM.json``.
+    """Run `count` units from number `first` and write ``STEM.rows``, ``STEM.npz`` and, last, ``STEM.json``.
 
     Parameters
     ----------
     config_json
         The config, as `Config.to_json` gives it.
+    first, count
+        Which units of work: the loops of trial 0, then those of trial 1, and so on; as a rule a trial has one.
     stem
         Path of the results without their endings.
     trace
-        First and last episode whose steps are kept, of trial 0.
+        First and last episode whose steps are kept, of unit 0.
     on_rows, prepare
         Further listeners as `run_trial` takes them; only within one process.
 
     Raises
     ------
     MapekError
-        The results could not be written: nothing of this chunk stays. Or a trial failed: the trials before it are
-        stored as a chunk, and its own finished passes as ``broken-TRIAL.npz`` beside it.
+        The results could not be written: nothing of this chunk stays. Or a unit failed: those before it are stored as
+        a chunk, and its own finished passes as ``broken-UNIT.npz`` beside it.
     """
     detectors.register()  # a worker process knows no adapters of its own
     config = from_table(json.loads(config_json))
     results: list[TrialResult] = []
     arrays: dict[str, npt.NDArray[Any]] = {}
     digest = hashlib.sha256()
-    whole_trials = digest.copy()
+    whole_units = digest.copy()
     failure: MapekError | None = None
     path = Path(stem)
     with whole(path.with_suffix(".rows")) as file:
-        for trial in range(first, first + count):
+        for unit in range(first, first + count):
+            trial, turn = divmod(unit, config.loops)
 
-            def keep(rows: npt.NDArray[np.void], trial: int = trial) -> None:
-                block = from_rows(trial, rows).tobytes()
+            def keep(rows: npt.NDArray[np.void], trial: int = trial, turn: int = turn) -> None:
+                block = from_rows(trial, turn, rows).tobytes()
                 digest.update(block)
                 file.write(block)
                 if on_rows is not None:
@@ -73,48 +76,52 @@ def run_chunk(
             steps: list[npt.NDArray[np.void]] = []
             kept: list[Loop] = []
 
-            def ready(loop: Loop, trial: int = trial, steps: list[Any] = steps, kept: list[Loop] = kept) -> None:
+            def ready(loop: Loop, unit: int = unit, steps: list[Any] = steps, kept: list[Loop] = kept) -> None:
                 kept.append(loop)
-                if trace is not None and trial == 0:
+                if trace is not None and unit == 0:
                     loop.execute.record_trace(*trace, lambda number, rows: steps.append(_traced(number, rows)))
                 if prepare is not None:
                     prepare(loop)
 
             try:
-                results.append(run_trial(config, trial, make_system, on_rows=keep, prepare=ready))
+                results.append(run_trial(config, trial, make_system, loop=turn, on_rows=keep, prepare=ready))
             except MapekError as error:
-                _break_off(file, len(results) * config.episodes, path.parent / f"broken-{trial}.npz")
+                target = path.parent / f"broken-{unit}.npz"
+                _break_off(file, len(results) * config.episodes, target, config.loops)
                 if not results:
                     raise
                 failure = error
                 break
-            whole_trials = digest.copy()
+            whole_units = digest.copy()
             table = kept[0].execute.q_table
-            arrays[f"q_{trial}"] = table.values
-            arrays[f"actions_{trial}"] = np.array(table.actions, dtype=np.int64)
-            if trial == 0 and trace is not None:
+            arrays[f"q_{unit}"] = table.values
+            arrays[f"actions_{unit}"] = np.array(table.actions, dtype=np.int64)
+            if unit == 0 and trace is not None:
                 arrays["trace"] = np.concatenate(steps) if steps else np.empty(0, TRACE_DTYPE)
-    with whole(path.with_suffix(".npz")) as file:
-        np.savez(file, allow_pickle=False, **arrays)
-    write_json(
-        path.with_suffix(".json"),
-        {
-            "rows": len(results) * config.episodes,
-            "rows_sha256": whole_trials.hexdigest(),
-            "trials": [r._asdict() for r in results],
-        },
-    )
+    write_heads(path, results, arrays, len(results) * config.episodes, whole_units.hexdigest())
     if failure is not None:
         raise failure
     return results
 
 
-def _break_off(file: IO[bytes], rows: int, target: Path) -> None:
-    """Cut the rows of a broken trial off a chunk, and store them by themselves."""
+def write_heads(
+    stem: Path, results: list[TrialResult], arrays: dict[str, npt.NDArray[Any]], rows: int, rows_sha256: str
+) -> None:
+    """Write what stands beside a chunk's rows: its arrays and, last, its results, which say that it is whole."""
+    with whole(stem.with_suffix(".npz")) as file:
+        np.savez(file, allow_pickle=False, **arrays)
+    write_json(
+        stem.with_suffix(".json"),
+        {"rows": rows, "rows_sha256": rows_sha256, "trials": [r._asdict() for r in results]},
+    )
+
+
+def _break_off(file: IO[bytes], rows: int, target: Path, loops: int = 1) -> None:
+    """Cut the rows of a broken unit off a chunk, and store them by themselves."""
     file.flush()
     broken = os.stat(file.name).st_size // DTYPE.itemsize - rows
     if broken:
-        write_npz(target, [Path(file.name)], broken, skip=rows)
+        write_npz(target, [Path(file.name)], broken, skip=rows, loops=loops)
     file.truncate(rows * DTYPE.itemsize)
     file.seek(0, 2)
 
@@ -138,7 +145,8 @@ def read_chunk(stem: Path) -> list[TrialResult] | None:
                 f"Delete {stem}.* to have these trials run again."
             )
         stem.with_suffix(".npz").stat()
-        return [TrialResult(**{**trial, "alarms": tuple(trial["alarms"])}) for trial in head["trials"]]
+        lists = ("alarms", "handed_over")
+        return [TrialResult(**{**one, **{name: tuple(one[name]) for name in lists}}) for one in head["trials"]]
     except (OSError, KeyError, TypeError) as error:
         raise ResultsError(f"{stem}.* is damaged ({error}); delete it to have these trials run again") from error
 

@@ -1,14 +1,16 @@
 """The folder of a run.
 
 config-AGENT.json     effective config, which `mapek run` takes as it is
-manifest.json         what runs, with seeds and versions
+manifest.json         what runs, with seeds and versions; and which command began it, in which folder
 chunks/               finished trials, as they come; gone when the run is complete. Of a trial that failed,
-                      broken-TRIAL.npz holds the passes before the failure
+                      broken-UNIT.npz holds the passes before the failure
 episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
-q_tables-AGENT.npz    Q-tables at the end: q_TRIAL (actions x states), actions_TRIAL (ids of the rows)
-trace-AGENT.npy       steps of the traced episodes of trial 0
+q_tables-AGENT.npz    Q-tables at the end: q_UNIT (actions x states), actions_UNIT (ids of the rows)
+trace-AGENT.npy       steps of the traced episodes of unit 0
 result.json           what the command found, with the hashes; its presence says that the run is complete
 figures/              PNG and PDF
+
+A unit of work is a trial, or one loop of it: unit ``trial * loops + loop``. What is said of trials below is of units.
 """
 
 from __future__ import annotations
@@ -19,9 +21,8 @@ import json
 import os
 import platform
 import shutil
-import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ from mape.errors import ResultsError
 from mape.trials import TrialResult
 
 FORMAT = 1
+
+BEGUN_BY = ("command", "cwd")
+"""Entries of a manifest that do not say what runs: the same run may be gone on with from elsewhere."""
 
 
 def versions() -> dict[str, str]:
@@ -77,6 +81,28 @@ def default_path(name: str) -> Path:
     raise AssertionError
 
 
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Read what runs, or ran, in a folder.
+
+    Raises
+    ------
+    ResultsError
+        It is no folder of a run of ours, or its manifest is damaged.
+    """
+    manifest = path / "manifest.json"
+    if not manifest.is_file():
+        raise ResultsError(f"{path} holds no run of ours; name the folder that `mapek` wrote (results/NAME-DATE-TIME)")
+    try:
+        there = read_json(manifest)
+    except ResultsError as error:
+        raise ResultsError(
+            f"{manifest} is damaged ({error.__cause__}); what runs in the folder is not known"
+        ) from error
+    if not isinstance(there, dict) or "format" not in there or "agents" not in there:
+        raise ResultsError(f"{manifest} is of no run of ours; name the folder that `mapek` wrote")
+    return there
+
+
 class RunFolder:
     """A folder that holds one run, of one or several agents, and nothing else.
 
@@ -90,6 +116,8 @@ class RunFolder:
         Agent -> config.
     trace
         Episodes of trial 0 whose steps are kept; a run that is continued has the same.
+    command
+        Arguments of the command line, with which `mapek resume` goes on; what is None is not known.
 
     Raises
     ------
@@ -98,10 +126,16 @@ class RunFolder:
     """
 
     def __init__(
-        self, path: Path, kind: str, configs: Mapping[str, Config], trace: tuple[int, int] | None = None
+        self,
+        path: Path,
+        kind: str,
+        configs: Mapping[str, Config],
+        trace: tuple[int, int] | None = None,
+        command: Sequence[str] | None = None,
     ) -> None:
         self.path = path
         self.configs = dict(configs)
+        self.command = None if command is None else list(command)
         self.resumed = 0
         wanted = {
             "format": FORMAT,
@@ -146,7 +180,7 @@ class RunFolder:
             remove_parts(self.path)
             for agent in self.configs:
                 write_json(self.path / f"config-{agent}.json", wanted["agents"][agent])
-            write_json(manifest, wanted)
+            write_json(manifest, {**wanted, "command": self.command, "cwd": os.getcwd()})
             return
         if (self.path / "result.json").exists():
             raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
@@ -158,8 +192,9 @@ class RunFolder:
             ) from error
         if not isinstance(there, dict) or "format" not in there or "agents" not in there:
             raise ResultsError(f"{manifest} is of no run of ours; choose another --out")
-        if there != wanted:
-            what, had, has = _first_difference(there, wanted)
+        runs = {name: value for name, value in there.items() if name not in BEGUN_BY}
+        if runs != wanted:
+            what, had, has = _first_difference(runs, wanted)
             raise ResultsError(
                 f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; give the same command to "
                 "continue it, or choose another --out"
@@ -181,7 +216,7 @@ class RunFolder:
         found: dict[int, TrialResult] = {}
         for stem in self._stems(agent):
             for result in read_chunk(stem) or ():
-                found[result.trial] = result
+                found[self.configs[agent].unit(result.trial, result.loop)] = result
         return found
 
     def assemble(self, agent: str) -> None:
@@ -191,7 +226,8 @@ class RunFolder:
         write_npz(
             self.path / f"episodes-{agent}.npz",
             [stem.with_suffix(".rows") for stem in stems],
-            config.trials * config.episodes,
+            config.units * config.episodes,
+            loops=config.loops,
         )
         arrays: dict[str, npt.NDArray[Any]] = {}
         for stem in stems:
@@ -224,7 +260,7 @@ class RunFolder:
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write the result, and remove the chunks that are now in the tables."""
-        write_json(self.path / "result.json", {"command": sys.argv[1:], "versions": versions(), **result})
+        write_json(self.path / "result.json", {"command": self.command, "versions": versions(), **result})
         shutil.rmtree(self.path / "chunks", ignore_errors=True)
 
     def close(self) -> None:

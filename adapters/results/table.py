@@ -1,5 +1,8 @@
 """The per-episode table: one row per trial and episode, taken from the log's rows.
 
+Where a trial has several loops, there is one row per trial, loop and episode, and what is said of trials below holds
+for the loops of all trials, one after the other.
+
 ============ ========= =======================================================================
 column       type      meaning
 ============ ========= =======================================================================
@@ -12,6 +15,7 @@ td_error     float64   mean absolute TD error
 q_change     float64   largest absolute change of Q from the end of the episode before
 alarm        bool      whether a detector alarmed at the end of the episode
 actions      uint16    number of actions that were available
+loop         uint32    number of the loop within the trial, from 0; only where a trial has several
 ============ ========= =======================================================================
 """
 
@@ -40,18 +44,21 @@ DTYPE = np.dtype(
         ("q_change", "<f8"),
         ("alarm", "?"),
         ("actions", "<u2"),
+        ("loop", "<u4"),
     ]
 )
-COLUMNS: tuple[str, ...] = tuple(DTYPE.names or ())
+COLUMNS: tuple[str, ...] = tuple(name for name in DTYPE.names or () if name != "loop")
+"""Columns of every table."""
 
 BLOCK = 65_536
 """Rows that are held in memory at a time."""
 
 
-def from_rows(trial: int, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+def from_rows(trial: int, loop: int, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     """Take the table's columns from a segment of the log's rows."""
     table = np.empty(len(rows), DTYPE)
     table["trial"] = trial
+    table["loop"] = loop
     table["episode"] = rows["pass"]
     table["steps"] = rows["steps"]
     table["epsilon"] = rows["epsilon"]
@@ -62,14 +69,15 @@ def from_rows(trial: int, rows: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     return table
 
 
-def write_npz(path: Path, chunks: Iterable[Path], rows: int, skip: int = 0) -> None:
+def write_npz(path: Path, chunks: Iterable[Path], rows: int, skip: int = 0, *, loops: int = 1) -> None:
     """Write `rows` rows of chunk files as one ``.npz`` with an array per column, with a block of them in memory.
 
-    The first `skip` rows of each file are left out.
+    The first `skip` rows of each file are left out. Where a trial has several `loops` there is a column of their
+    numbers.
     """
     files = list(chunks)
     with whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for column in COLUMNS:
+        for column in (*COLUMNS, "loop") if loops > 1 else COLUMNS:
             with archive.open(f"{column}.npy", "w", force_zip64=True) as member:
                 _write_column(member, column, files, rows, skip)
 
@@ -128,11 +136,11 @@ def _opened(path: str | Path, columns: Iterable[str]) -> Iterator[Any]:
 
 
 def _shape(archive: Any) -> tuple[int, int]:
-    """Return the number of trials, whose rows stand together, and of the episodes of each."""
-    trials, rows, last = 0, 0, -1
-    for block in _blocks(archive, "trial"):
-        trials += int(block[0] != last) + int(np.count_nonzero(block[1:] != block[:-1]))
-        rows, last = rows + len(block), int(block[-1])
+    """Return the number of trials, or of their loops, whose rows stand together, and of the episodes of each."""
+    trials, rows = 0, 0
+    for block in _blocks(archive, "episode"):
+        trials += int(np.count_nonzero(block == 1))
+        rows += len(block)
     if not trials or rows % trials:
         raise ValueError(f"{rows} rows are of no whole number of episodes for {trials} trials")
     return trials, rows // trials

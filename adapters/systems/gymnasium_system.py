@@ -99,7 +99,7 @@ class GymnasiumSystem:
     env
         A Gymnasium environment with discrete actions.
     config
-        How it is seen: step cap, discretiser.
+        How it is seen: step cap, discretiser, whether its episodes can be driven again.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any], config: SystemConfig) -> None:
@@ -127,6 +127,8 @@ class GymnasiumSystem:
         self.draws: tuple[int, int] = (0, 0)
         if self.rules is not None:
             self.draws = (self.rules.reset_draws, self.rules.step_draws)
+        declared_redrivable = getattr(self._base, "redrivable", True)  # every reset is seeded
+        self.redrivable = bool(declared_redrivable if config.redrivable is None else config.redrivable)
         self._block = getattr(self.rules, "episode_draws", 0)
         self._mask: npt.NDArray[np.int8] | None = None
         self._first_action = 0

@@ -22,6 +22,7 @@ class Changes:
     """Every alarm is a drift; where two detectors watch one signal, the first that alarms names the direction."""
 
     Config = ChangesConfig
+    state_format = "changes/1"
 
     def __init__(self, config: ChangesConfig) -> None:
         self.config = config

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 from knowledge import ChangeRequest, Symptom
 from mape.errors import PartError
-from mape.ports import Analyzer
+from mape.ports import Analyzer, Json
+from mape.states import hand_over, restore, state_of
 
 
 class Analyze:
@@ -45,3 +46,39 @@ class Analyze:
                 "returns a ChangeRequest"
             )
         self._send(request)
+
+    def state(self) -> Json:
+        """Return the analyzer's state: all that is carried from pass to pass.
+
+        Raises
+        ------
+        PartError
+            The analyzer does not give it.
+        """
+        return state_of("analyzer", self.analyzer)
+
+    def restore(self, state: Json) -> None:
+        """Go on where another Analyze of the same config gave `state`.
+
+        Raises
+        ------
+        PartError
+            The analyzer does not take it.
+        """
+        restore("analyzer", self.analyzer, state)
+
+    def replace(self, analyzer: Analyzer) -> bool:
+        """Let `analyzer` answer from the next Symptom on.
+
+        Returns
+        -------
+        Whether it took over the old one's state, which it does where both give it in the same format.
+
+        Raises
+        ------
+        PartError
+            It does not take the state; then the old one stays.
+        """
+        handed_over = hand_over("analyzer", self.analyzer, analyzer)
+        self.analyzer = analyzer
+        return handed_over

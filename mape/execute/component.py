@@ -11,16 +11,16 @@ import numpy.typing as npt
 
 from knowledge import ChangePlan, Knowledge, Observation, QTable
 from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
-from mape.execute import binding, drive, episode
-from mape.execute.refusals import refused
+from mape.execute import adoption, binding, drive, episode
+from mape.execute.checkpoint import Checkpoint, carried_by, take_up
+from mape.execute.refusals import check_offer, refused
 from mape.execute.rules import rate_array
-from mape.ports import Episode, Learner, ManagedSystem
+from mape.execute.uniforms import Uniforms
+from mape.execute.workspace import Workspace
+from mape.ports import Episode, Json, Learner, ManagedSystem
 
 SIGNALS = ("return", "steps", "td_error", "q_change")
 """Signals of every run: return, steps, mean |TD error|, largest absolute change of Q; the system's own follow."""
-
-DRAWS_AT_ONCE = 8192
-"""Uniforms drawn from the trial's generator in one go: cheaper per pass, and the same stream."""
 
 _new = tuple.__new__
 
@@ -36,7 +36,7 @@ class Execute:
     system, learner
         What is managed, and how it learns.
     knowledge
-        Its entries ``actions`` and the Q-table are written here.
+        Its entries ``actions`` and the Q-table are written here; the number of its log's loop stands in the records.
     send
         Takes the Observation.
     seed, trial, loop
@@ -70,8 +70,7 @@ class Execute:
         self.passes = 0
         self._knowledge = knowledge
         self._send = send
-        self.trial = trial
-        self._loop = loop
+        self._loop = knowledge.log.loop
         self._seeds = (seed, loop, trial)
         self._max_actions = max_actions
         self._own_signals = system.signal_names
@@ -87,37 +86,26 @@ class Execute:
         reset_draws, step_draws = system.draws
         cap = system.max_steps
         self._system_draws = reset_draws + cap * step_draws
-        self._width = self._system_draws + 2 * cap
-        self._per_refill = max(1, DRAWS_AT_ONCE // self._width)
-        sequence = np.random.SeedSequence(entropy=seed, spawn_key=(loop, trial))
-        self._generator = np.random.Generator(np.random.PCG64(sequence))
-        self._uniforms = np.empty(self._per_refill * self._width)
-        self._drawn = -1  # passes before those whose blocks are in `_uniforms`
+        self._uniforms = Uniforms(seed, (loop, trial), self._system_draws + 2 * cap)
 
-        self._journal = np.empty(cap, dtype=np.int64)
-        self._saved = np.empty(cap)
-        self._used = np.zeros(2, dtype=np.int64)
+        self._workspace = Workspace(cap)
         self._context = np.zeros(len(system.signal_names))
         self._no_trace = np.empty((0, len(episode.TRACE_COLUMNS)))
-        self._tail = (learner.discount, learner.bootstrap_terminal, mask_greedy, reset_draws, step_draws, cap)
+        self._limits = (mask_greedy, reset_draws, step_draws, cap)
         self._called = drive.Called(system)
         self._target: Any = self._called if self._rules is None else self._rules.params
         self._available: tuple[int, ...] = ()
+        self._enabled: tuple[int, ...] = ()  # by all plans so far
         self._rate = rate_array((0.0,) * len(learner.rate_names))
 
         self._begun = 0  # the episode whose reset has been done ahead of its drive
         first = system.available(1)
         if first is None:  # only a reset can tell; episode 1 then goes on from it
-            self._draw()
-            first = self._begin(1, self._uniforms[: self._width])
+            first = self._begin(1, self._uniforms.find(0))
             self._begun = 1
         self._take_actions(first, 1)
         self._set_table(QTable(first, system.n_states))
-        self._drive = (
-            binding.by_calls(learner)
-            if self._rules is None
-            else binding.by_rules(self._rules, learner, (1, 0.5, 0, self._no_trace, *self._fixed))
-        )
+        self._drive = self._bound(learner)
         knowledge.serve_q_table(lambda: self.q_table.copy())
 
     def record_trace(self, first: int, last: int, listener: Callable[[int, npt.NDArray[np.float64]], object]) -> None:
@@ -142,10 +130,11 @@ class Execute:
         rates = self._rate
         changed = self.plan is None or (rate is not self.plan.learning_rate and rate != self.plan.learning_rate)
         if changed:
-            rates = self._checked_rate(plan)
+            rates = adoption.checked_rate(plan, self.learner)
         if add or drop or enable or adopt is not None:
-            table = self._table_after(plan)
-            self._enable(plan)
+            table = adoption.table_after(plan, self.q_table, self._available, self.system, self._knowledge)
+            if enable:
+                self._enable(plan)
             self._set_table(table)
         if changed:
             self._rate = rates
@@ -166,17 +155,14 @@ class Execute:
         if plan is None:
             raise PartError("no plan is in force; plan 0 starts a run")
         number = self.passes + 1
-        turn = self.passes % self._per_refill
-        if turn == 0 and self._drawn != self.passes:  # an episode that failed is driven again with the same block
-            self._draw()
-        at = turn * self._width
+        at = self._uniforms.find(self.passes)
 
         available = self.system.available(number) if self._rules is not None else None
         if available is None:
             if self._begun == number:
                 available, self._begun = self._available, 0
             else:
-                available = self._begin(number, self._uniforms[at : at + self._width])
+                available = self._begin(number, at)
         if available is not self._available:
             self._take_actions(available, number)
             self._set_rows()
@@ -185,16 +171,16 @@ class Execute:
         try:
             status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
         except BaseException as error:
-            self._roll_back()
+            self._workspace.roll_back()
             if isinstance(error, MapekError) or not isinstance(error, Exception):
                 raise
             raise ManagedSystemError(
                 f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step "
-                f"{int(self._used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes before it "
-                "stand in the log."
+                f"{int(self._workspace.used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes "
+                "before it stand in the log."
             ) from error
         if status != episode.OK:
-            self._roll_back()
+            self._workspace.roll_back()
             raise refused(status, self.system, number, steps, (total, td_error, change))
         signals = {"return": total, "steps": float(steps), "td_error": td_error, "q_change": change}
         if self._own_signals:
@@ -224,32 +210,87 @@ class Execute:
         """Whether an episode is one compiled call."""
         return self._rules is not None
 
+    def state(self) -> tuple[Json, QTable]:
+        """Return what a fresh Execute needs to go on from here: plain JSON, and a copy of the Q-table.
+
+        It is whole between two episodes; a restored Execute that is sent the plans from then on drives the same ones.
+
+        Raises
+        ------
+        ManagedSystemError
+            The system raised when it was asked for what it carries.
+        """
+        carried = carried_by(self.system)
+        at = Checkpoint(self.passes, self.plan, self._available, self._enabled, carried)
+        return at.as_json(), self.q_table.copy()
+
+    def restore(self, state: Json, table: QTable) -> None:
+        """Go on where `state` was given by another Execute of the same config, trial and loop; this one is fresh.
+
+        Raises
+        ------
+        PartError
+            State or table are not of such an Execute.
+        ManagedSystemError
+            The system does not go on from what the other one carried.
+        """
+        at = Checkpoint.of(state)
+        if table.n_states != self.system.n_states:
+            raise PartError(
+                f"Execute cannot go on with a Q-table of {table.n_states} states; {self.system.name} has "
+                f"{self.system.n_states}"
+            )
+        rate = self._rate if at.plan is None else adoption.checked_rate(at.plan, self.learner)
+        take_up(self.system, at.system, at.enabled)
+        self.passes, self.plan, self._rate, self._enabled = at.passes, at.plan, rate, at.enabled
+        self._take_actions(at.available, self.passes)
+        self._set_table(table.copy())
+
+    def replace(self, learner: Learner) -> None:
+        """Learn by another learner from the next episode on; the Q-table and the plan in force stay.
+
+        Raises
+        ------
+        PartError
+            It takes another number of learning-rate parameters; then the old one stays.
+        ConfigError
+            Its rules cannot be compiled; then the old one stays.
+        """
+        old, new = self.learner.rate_names, learner.rate_names
+        if len(new) != len(old):
+            raise PartError(
+                f"learner {type(learner).__name__} takes {len(new)} learning-rate parameters ({', '.join(new)}), the "
+                f"one before it {len(old)} ({', '.join(old)}); the number is fixed for a run"
+            )
+        self._drive, self.learner = self._bound(learner), learner
+        self._fix_arguments()
+
+    def _bound(self, learner: Learner) -> binding.Driver:
+        if self._rules is None:
+            return binding.by_calls(learner)
+        return binding.by_rules(self._rules, learner, (1, 0.5, 0, self._no_trace, *self._arguments(learner)))
+
     def _fix_arguments(self) -> None:
+        self._fixed = self._arguments(self.learner)
+
+    def _arguments(self, learner: Learner) -> tuple[Any, ...]:
         # What stays from episode to episode, in the order of `episode.episode`.
-        self._fixed = (
+        return (
             self._target,
-            self.q_table.values,
-            self._touched,
-            self._journal,
-            self._saved,
-            self._used,
-            self._rows,
-            self._choices,
-            self._actions,
+            *self._workspace.arguments,
             self._rate,
-            self._uniforms,
+            self._uniforms.values,
             self._context,
-            *self._tail,
+            learner.discount,
+            learner.bootstrap_terminal,
+            *self._limits,
         )
 
-    def _draw(self) -> None:
-        self._generator.random(out=self._uniforms)
-        self._drawn = self.passes
-
-    def _begin(self, number: int, block: npt.NDArray[np.float64]) -> tuple[int, ...]:
+    def _begin(self, number: int, at: int) -> tuple[int, ...]:
         seed, *key = self._seeds
         sequence = np.random.SeedSequence(entropy=seed, spawn_key=(*key, number))
-        told = Episode(number, int(sequence.generate_state(1)[0]), block[: self._system_draws])
+        block = self._uniforms.values[at : at + self._system_draws]
+        told = Episode(number, int(sequence.generate_state(1)[0]), block)
         try:
             self._called.state, available = self.system.begin(told)
         except MapekError:
@@ -263,26 +304,13 @@ class Execute:
         return self._available if available == self._available else available
 
     def _take_actions(self, available: tuple[int, ...], number: int) -> None:
-        if not available:
-            raise ManagedSystemError(
-                f"{self.system.name} offers no action in episode {number}; a managed system has at least one available"
-            )
-        if len(set(available)) != len(available):
-            raise ManagedSystemError(
-                f"{self.system.name} offers actions {available} in episode {number}; name each action once"
-            )
-        for action in available:
-            if not 0 <= action < self._max_actions:
-                raise ManagedSystemError(
-                    f"{self.system.name} offers action {action} in episode {number}; ids are integers from 0 to "
-                    f"{self._max_actions - 1}. Raise system.max_actions if it has more."
-                )
+        check_offer(available, self.system, number, self._max_actions)
         self._available = available
 
     def _add_own_signals(self, signals: dict[str, float], number: int) -> None:
         for name, value in zip(self._own_signals, self._context.tolist(), strict=True):
             if not isfinite(value):
-                self._roll_back()
+                self._workspace.roll_back()
                 raise NonFiniteError(
                     f"{self.system.name} gave {name} = {value} in episode {number}; signals are finite. Nothing of "
                     f"that episode was learnt; the {self.passes} passes before it stand in the log."
@@ -291,74 +319,22 @@ class Execute:
 
     def _set_table(self, table: QTable) -> None:
         self.q_table = table
-        # Stamps are episode numbers, from 1: a fresh table is untouched.
-        self._touched = np.zeros(table.values.shape, dtype=np.int64)
-        self._actions = np.array(table.actions, dtype=np.int64)
+        self._workspace.open(table)
         self._knowledge.actions = table.actions
         self._set_rows()
 
     def _set_rows(self) -> None:
-        usable = [row for row, action in enumerate(self.q_table.actions) if action in self._available]
-        if not usable:
+        if not self._workspace.offer(self._available):
             raise ManagedSystemError(
                 f"{self.system.name} offers actions {self._available}, of which the Q-table knows none: it has "
                 f"{self.q_table.actions}. A new action is first tried in the episode after the one that reports it, so "
                 "at least one known action must stay."
             )
-        self._rows = np.array(usable, dtype=np.int64)
-        self._choices = np.empty_like(self._rows)
         self._fix_arguments()
 
-    def _checked_rate(self, plan: ChangePlan) -> npt.NDArray[np.float64]:
-        names = self.learner.rate_names
-        if len(plan.learning_rate) != len(names):
-            raise PartError(
-                f"plan {plan.pass_no} has {len(plan.learning_rate)} learning-rate parameters; the learner takes "
-                f"{len(names)}: {', '.join(names)}"
-            )
-        rates: npt.NDArray[np.float64] = rate_array(plan.learning_rate)
-        if not np.isfinite(rates).all():
-            raise PartError(f"plan {plan.pass_no} has the learning rate {plan.learning_rate}; it is of finite numbers")
-        return rates
-
-    def _table_after(self, plan: ChangePlan) -> QTable:
-        try:
-            table = self.q_table.copy() if plan.adopt is None else self._knowledge.recall(plan.adopt)
-            table.add(plan.add)
-            table.drop(plan.drop)
-        except (LookupError, ValueError) as error:
-            raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
-        if table.n_states != self.system.n_states:
-            raise PartError(
-                f"plan {plan.pass_no} adopts a Q-table of {table.n_states} states; {self.system.name} has "
-                f"{self.system.n_states}"
-            )
-        if not set(table.actions) & {*self._available, *plan.enable}:
-            raise PartError(
-                f"plan {plan.pass_no} leaves a Q-table of the actions {table.actions}; {self.system.name} offers "
-                f"{self._available}, of which at least one must stay"
-            )
-        return table
-
     def _enable(self, plan: ChangePlan) -> None:
-        if not plan.enable:
-            return
-        try:
-            self.system.enable(plan.enable)
-        except ValueError as error:
-            raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
-        except Exception as error:
-            raise ManagedSystemError(
-                f"{self.system.name} raised {type(error).__name__}: {error}, while it enabled the actions "
-                f"{plan.enable} of plan {plan.pass_no}"
-            ) from error
+        adoption.enable(plan, self.system)
+        self._enabled += tuple(action for action in plan.enable if action not in self._enabled)
         after = self.system.available(self.passes + 1)
         if after is not None:
             self._available = after
-
-    def _roll_back(self) -> None:
-        values = self.q_table.values.reshape(-1)
-        used = int(self._used[0])
-        values[self._journal[:used]] = self._saved[:used]
-        # Driven again, the episode saves these pairs anew.
-        self._touched.reshape(-1)[self._journal[:used]] = 0

@@ -1,4 +1,4 @@
-"""What is said of an episode that was broken off, and not learnt from."""
+"""What is said of an episode that cannot be driven, or that was broken off and not learnt from."""
 
 from __future__ import annotations
 
@@ -33,3 +33,25 @@ def refused(
     return NonFiniteError(
         f"{system.name} gave reward {first} for action {int(action)} {where}; rewards are finite numbers. {kept}"
     )
+
+
+def check_offer(available: tuple[int, ...], system: ManagedSystem, number: int, max_actions: int) -> None:
+    """Look at the actions that a system offers in episode `number`.
+
+    Raises
+    ------
+    ManagedSystemError
+        There is none, one is named twice, or one is outside ``0 .. max_actions - 1``.
+    """
+    if not available:
+        raise ManagedSystemError(
+            f"{system.name} offers no action in episode {number}; a managed system has at least one available"
+        )
+    if len(set(available)) != len(available):
+        raise ManagedSystemError(f"{system.name} offers actions {available} in episode {number}; name each action once")
+    for action in available:
+        if not 0 <= action < max_actions:
+            raise ManagedSystemError(
+                f"{system.name} offers action {action} in episode {number}; ids are integers from 0 to "
+                f"{max_actions - 1}. Raise system.max_actions if it has more."
+            )

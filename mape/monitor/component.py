@@ -8,7 +8,8 @@ from math import isfinite
 from knowledge import Observation, Reading, Symptom
 from knowledge.rows import DIRECTIONS
 from mape.errors import PartError
-from mape.ports import Detector
+from mape.ports import Detector, Json
+from mape.states import hand_over, restore, state_of
 
 _new = tuple.__new__  # half the cost of a named tuple's own constructor, on the hot path
 
@@ -30,11 +31,7 @@ class Monitor:
     def __init__(self, detectors: Sequence[tuple[str, Detector]], send: Callable[[Symptom], object]) -> None:
         self.detectors = tuple(detectors)
         for name, detector in self.detectors:
-            if (direction := getattr(detector, "direction", None)) not in DIRECTIONS:
-                raise PartError(
-                    f"detector {type(detector).__name__} on {name} watches the side {direction!r}; its direction is "
-                    f"one of {', '.join(DIRECTIONS)}"
-                )
+            self._check(name, detector)
         self._send = send
 
     def on_observation(self, seen: Observation) -> None:
@@ -62,6 +59,56 @@ class Monitor:
                 raise self._failed(name, detector, seen, error) from error
             readings += (reading,)
         self._send(_new(Symptom, (loop, number, signals, available, known, readings)))
+
+    def state(self) -> Json:
+        """Return the states of the detectors, in their order: all that is carried from pass to pass.
+
+        Raises
+        ------
+        PartError
+            A detector does not give its state.
+        """
+        return [state_of("detector", detector) for _, detector in self.detectors]
+
+    def restore(self, state: Json) -> None:
+        """Go on where another Monitor of the same config gave `state`.
+
+        Raises
+        ------
+        PartError
+            It is of another number of detectors, or one of them does not take its state.
+        """
+        if not isinstance(state, list) or len(state) != len(self.detectors):
+            raise PartError(f"Monitor cannot go on from {state!r}; give a state for each of {len(self.detectors)}")
+        for (_, detector), one in zip(self.detectors, state, strict=True):
+            restore("detector", detector, one)
+
+    def replace(self, place: int, signal: str, detector: Detector) -> bool:
+        """Let `detector` watch `signal` in the place of the detector number `place`, from the next Observation on.
+
+        Returns
+        -------
+        Whether it took over the old one's state, which it does where it watches the same signal and both give their
+        state in the same format.
+
+        Raises
+        ------
+        PartError
+            It watches no side, or does not take the state; then the old one stays.
+        """
+        self._check(signal, detector)
+        watched, old = self.detectors[place]
+        handed_over = watched == signal and hand_over("detector", old, detector)
+        self.detectors = (*self.detectors[:place], (signal, detector), *self.detectors[place + 1 :])
+        return handed_over
+
+    @staticmethod
+    def _check(name: str, detector: Detector) -> None:
+        if (direction := getattr(detector, "direction", None)) not in DIRECTIONS:
+            raise PartError(
+                f"detector {type(detector).__name__} on {name} watches the side {direction!r}; its direction is "
+                f"one of {', '.join(DIRECTIONS)}"
+            )
 
     @staticmethod
     def _failed(name: str, detector: Detector, seen: Observation, error: Exception) -> PartError:

@@ -26,6 +26,8 @@ class OracleConfig(PartConfig):
 class Oracle:
     """Alarms at the end of each named episode: the first one of a new regime, as a rule.
 
+    It counts the episodes that it sees: swapped in on the way, it counts from there, or on from another oracle's count.
+
     Examples
     --------
     >>> oracle = Oracle(OracleConfig(episodes=(2,)))
@@ -36,6 +38,7 @@ class Oracle:
     Config = OracleConfig
     direction: Direction = "unknown"
     statistic = None
+    state_format = "oracle/1"
 
     def __init__(self, config: OracleConfig) -> None:
         self.config = config

@@ -51,6 +51,7 @@ class PageHinkley:
 
     Config = PageHinkleyConfig
     direction: Direction = "down"
+    state_format = "page_hinkley/1"
 
     def __init__(self, config: PageHinkleyConfig) -> None:
         self.config = config

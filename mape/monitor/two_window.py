@@ -51,6 +51,7 @@ class TwoWindow:
     """
 
     Config = TwoWindowConfig
+    state_format = "two_window/1"
 
     def __init__(self, config: TwoWindowConfig) -> None:
         self.config = config

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge
 from mape.errors import PartError
-from mape.ports import Planner
+from mape.ports import Json, Planner, Schedule
+from mape.specs import PartSpec
+from mape.states import hand_over, restore, state_of
 
 
 class Plan:
@@ -24,17 +27,16 @@ class Plan:
 
     def __init__(self, planner: Planner, knowledge: Knowledge, send: Callable[[ChangePlan], object]) -> None:
         self.planner = planner
+        self.schedule_spec: PartSpec | None = None  # of the schedule that took the place of the config's, if one did
         self._knowledge = knowledge
         self._send = send
         self._rate: tuple[float, ...] | None = None  # the last one seen, which is as a rule the next
 
     def start(self, loop: int) -> ChangePlan:
         """Send plan 0, which starts the run, and return it."""
-        try:
-            plan = self.planner.start(loop)
-        except Exception as error:
-            raise self._failed(0, error) from error
-        self._put(plan, 0)
+        plan = self._started(loop)
+        self._knowledge.plan = plan
+        self._send(plan)
         return plan
 
     def on_request(self, request: ChangeRequest) -> None:
@@ -49,9 +51,86 @@ class Plan:
             plan = self.planner.plan(request, self._knowledge)
         except Exception as error:
             raise self._failed(request.pass_no, error) from error
-        self._put(plan, request.pass_no)
+        self._check(plan, request.pass_no)
+        self._knowledge.plan = plan
+        self._send(plan)
 
-    def _put(self, plan: ChangePlan, number: int) -> None:
+    def state(self) -> Json:
+        """Return the planner's state, its schedule's in it: all that is carried from pass to pass.
+
+        The plan in force stands in Knowledge.
+
+        Raises
+        ------
+        PartError
+            The planner does not give it.
+        """
+        return state_of("planner", self.planner)
+
+    def restore(self, state: Json) -> None:
+        """Go on where another Plan of the same config gave `state`.
+
+        Raises
+        ------
+        PartError
+            The planner does not take it.
+        """
+        restore("planner", self.planner, state)
+
+    def replace(self, planner: Planner) -> bool:
+        """Let `planner` answer from the next ChangeRequest on.
+
+        It is started as at the beginning of a run, but the plan that it starts with is not put in force.
+
+        Returns
+        -------
+        Whether it took over the old one's state, which it does where both give it in the same format.
+
+        Raises
+        ------
+        PartError
+            It does not start with a legal plan, or does not take the state; then the old one stays.
+        """
+        old, self.planner = self.planner, planner
+        try:
+            self._started(self._knowledge.log.loop)
+            return hand_over("planner", old, planner)
+        except BaseException:
+            self.planner = old
+            raise
+
+    def replace_schedule(self, schedule: Schedule) -> bool:
+        """Let the planner explore by `schedule` from its next plan on.
+
+        Returns
+        -------
+        Whether it took over the old one's state, which it does where both give it in the same format.
+
+        Raises
+        ------
+        PartError
+            The planner keeps no schedule that could be replaced, or the new one does not take the state; then the old
+            one stays.
+        """
+        planner: Any = self.planner
+        if not hasattr(planner, "schedule"):
+            raise PartError(
+                f"planner {type(planner).__name__} keeps no schedule in an attribute `schedule`; replace the planner "
+                "as a whole (part 'plan')"
+            )
+        handed_over = hand_over("schedule", planner.schedule, schedule)
+        planner.schedule = schedule
+        return handed_over
+
+    def _started(self, loop: int) -> ChangePlan:
+        try:
+            plan = self.planner.start(loop)
+        except Exception as error:
+            raise self._failed(0, error) from error
+        self._check(plan, 0)
+        return plan
+
+    def _check(self, plan: ChangePlan, number: int) -> None:
         if type(plan) is not ChangePlan:
             raise PartError(
                 f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a "
@@ -70,8 +149,6 @@ class Plan:
                 f"planner {type(self.planner).__name__} gave epsilon {epsilon!r} for pass {number}; an "
                 "exploration rate is a number in [0, 1]"
             )
-        self._knowledge.plan = plan
-        self._send(plan)
 
     def _failed(self, number: int, error: Exception) -> PartError:
         return PartError(

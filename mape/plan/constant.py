@@ -19,6 +19,7 @@ class Constant:
     """The same exploration rate for ever."""
 
     Config = ConstantConfig
+    state_format = "none/1"
 
     def __init__(self, config: ConstantConfig) -> None:
         self.config = config

@@ -35,6 +35,7 @@ class Exponential:
     """Exponential schedule over a counter of episodes."""
 
     Config: type[ExponentialConfig] = ExponentialConfig
+    state_format = "counter/1"
 
     def __init__(self, config: ExponentialConfig) -> None:
         self.config = config

@@ -29,6 +29,7 @@ class Geometric:
     """Geometric schedule."""
 
     Config = GeometricConfig
+    state_format = "epsilon/1"
 
     def __init__(self, config: GeometricConfig) -> None:
         self.config = config

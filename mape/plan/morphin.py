@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from knowledge import ChangePlan, ChangeRequest, Knowledge
 from mape.ports import Schedule
 from mape.specs import PartConfig
+from mape.states import joint_format
 
 _new = tuple.__new__
 
@@ -63,6 +64,11 @@ class Morphin:
         self._drift = "drift" in config.respond_to
         self._added = "added" in config.respond_to
         self._removed = "removed" in config.respond_to
+
+    @property
+    def state_format(self) -> str | None:
+        """Name of what `state` gives, which holds the schedule's."""
+        return joint_format("morphin/1", self.schedule)
 
     def start(self, loop: int) -> ChangePlan:
         """Return plan 0."""

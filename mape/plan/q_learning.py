@@ -12,6 +12,7 @@ from pydantic import Field
 from knowledge import ChangePlan, ChangeRequest, Knowledge
 from mape.ports import Schedule
 from mape.specs import PartConfig
+from mape.states import joint_format
 
 
 class QLearningPlannerConfig(PartConfig):
@@ -30,6 +31,11 @@ class QLearningPlanner:
         self.schedule = schedule
         # alpha_max = alpha makes the TD-error-driven step size exactly alpha.
         self._rate = (config.alpha, config.alpha, 0.0)
+
+    @property
+    def state_format(self) -> str | None:
+        """Name of what `state` gives, which holds the schedule's."""
+        return joint_format("q_learning/1", self.schedule)
 
     def start(self, loop: int) -> ChangePlan:
         """Return plan 0."""

@@ -43,6 +43,7 @@ class Success(Exponential):
     """Exponential schedule whose counter follows the success rule after the first response."""
 
     Config = SuccessConfig
+    state_format = "success/1"
 
     def __init__(self, config: SuccessConfig) -> None:
         super().__init__(config)

@@ -66,6 +66,8 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
         names = system.signal_names
         if not isinstance(names, tuple) or len({*names, *SIGNALS}) != len(names) + len(SIGNALS):
             raise Broken(f"signal_names is {names!r}; give a tuple of distinct names, none of {', '.join(SIGNALS)}")
+        if type(system.redrivable) is not bool:
+            raise Broken(f"redrivable is {system.redrivable!r}; it is True or False")
         if list(system.drifts) != sorted({*system.drifts}):
             raise Broken(f"drifts is {system.drifts!r}; give increasing episodes")
 
@@ -89,6 +91,11 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
 
     def redriven() -> None:
         system, other = fresh(), fresh()
+        if not system.redrivable:
+            raise Noted(
+                "not redrivable, as it says itself (redrivable = False): an episode that is broken off is not driven "
+                "again, and a run is not taken up elsewhere to the same bits"
+            )
         played = {}
         for number in range(1, EPISODES + 1):
             carried = _carried(system)
@@ -106,7 +113,8 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
                     ) from None
                 raise Noted(
                     f"not resumable: {broken}. Take all randomness from the episode's seed or uniforms, and the "
-                    "episode's number from the reset; or offer get_state() and set_state()"
+                    "episode's number from the reset; or offer get_state() and set_state(); or, where no episode can "
+                    "be had again, say redrivable = False"
                 ) from None
 
     def by_rules() -> None:
@@ -129,8 +137,8 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
 
     findings = judge(
         fresh,
-        "name n_states max_steps signal_names drifts draws rules "
-        "available() begin() step() explorable() enable() close()",
+        "name n_states max_steps signal_names drifts draws redrivable rules "
+        "available() begin() step() explorable() enable() get_state() set_state() close()",
         [
             ("describes itself in numbers", described),
             ("stays within its states, with finite rewards and known actions", plays),
@@ -155,12 +163,9 @@ def _episode(system: ManagedSystem, number: int) -> Episode:
 
 def _carried(system: ManagedSystem, state: Any = None) -> Any:
     """Return what a system says that it carries between episodes, or set it; None where it says nothing."""
-    optional: Any = system
-    if not hasattr(system, "get_state"):
-        return None
     if state is not None:
-        optional.set_state(json.loads(state))
-    carried = optional.get_state()
+        system.set_state(json.loads(state))
+    carried = system.get_state()
     return None if carried is None else plain_json(carried)
 
 

@@ -154,3 +154,26 @@ def test_without_a_state_there_is_none_to_give_or_take() -> None:
     system.set_state(None)
     with pytest.raises(ValueError, match="takes no state"):
         system.set_state({"played": 3})
+
+
+class Plant(Shifted):
+    """Something that goes on while nobody looks."""
+
+    redrivable = False
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "redrivable"),
+    [
+        ("Grows-v0", None, True),
+        ("Grows-v0", False, False),
+        ("Plant-v0", None, False),
+        ("Plant-v0", True, True),
+        ("FrozenLake-v1", None, True),
+    ],
+)
+def test_an_environment_can_be_driven_again_unless_it_or_the_config_says_no(name, said, redrivable):
+    gymnasium.register("Plant-v0", Plant, max_episode_steps=4)
+    system = make_system(SystemConfig(id=name, redrivable=said))
+    assert system.redrivable is redrivable
+    system.close()

@@ -1,8 +1,9 @@
 """Configs, small managed systems and runs that the tests of this folder share."""
 
 from adapters.systems import make_system
-from mape.config import from_table, merge
+from mape.config import from_table
 from mape.loop import Loop
+from mape.tables import merge
 
 GRID = {
     "name": "grid",
@@ -49,6 +50,7 @@ class Corridor:
     max_steps = 12
     drifts = ()
     draws = (0, 0)
+    redrivable = True
     rules = None
 
     def __init__(self, offers=lambda episode: (0, 1), spoil=lambda episode, step: {}, signal_names=()):
@@ -81,6 +83,12 @@ class Corridor:
 
     def enable(self, actions):
         self.enabled += tuple(actions)
+
+    def get_state(self):
+        return None
+
+    def set_state(self, state):
+        raise ValueError(f"a corridor carries nothing, and takes no {state}")
 
     def close(self):
         pass

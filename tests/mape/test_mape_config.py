@@ -4,8 +4,9 @@ from pathlib import Path
 import pytest
 from mape_runs import GRID
 
-from mape.config import Config, from_table, load, merge, overlays_of, parse_override, parts_of
+from mape.config import Config, SwapConfig, from_table, load, overlays_of, parts_of
 from mape.errors import ConfigError, UnknownName
+from mape.tables import merge, parse_override
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -268,3 +269,128 @@ def test_a_config_cannot_be_changed():
     assert isinstance(config, Config)
     with pytest.raises(ValueError, match="frozen"):
         config.episodes = 3
+
+
+SWAPPING = """
+episodes = 9
+[system]
+id = "x"
+[[swap]]
+pass = 6
+part = "plan"
+to = { name = "morphin", alpha = 0.3, schedule = { name = "constant", epsilon = 0.2 } }
+[[swap]]
+pass = 2
+part = "learner"
+to = "expected_sarsa"
+[[swap]]
+pass = 6
+part = "plan.schedule"
+to = { decay = 0.5, name = "exponential" }
+"""
+
+
+def test_swaps_are_tables_in_any_order_and_stand_in_order_of_their_pass(file):
+    chosen = load(file(SWAPPING))
+    assert [(swap.pass_no, swap.part, swap.to.name) for swap in chosen.swap] == [
+        (2, "learner", "expected_sarsa"),
+        (6, "plan", "morphin"),
+        (6, "plan.schedule", "exponential"),
+    ]
+    assert chosen.swap[1].to.options == {"alpha": 0.3, "schedule": {"name": "constant", "epsilon": 0.2}}
+
+
+def test_swaps_loops_and_the_mode_come_back_from_json_as_they_were(file):
+    chosen = load(file(SWAPPING), overrides=["loops=4", "execute={mode='free', rate=2.5, backlog=7}"])
+    again = from_table(json.loads(chosen.to_json()))
+    assert again == chosen
+    assert again.to_json() == chosen.to_json()
+    assert json.loads(chosen.to_json())["swap"][0] == {"pass": 2, "part": "learner", "to": {"name": "expected_sarsa"}}
+    assert (again.loops, again.execute.mode, again.execute.rate, again.execute.backlog) == (4, "free", 2.5, 7)
+
+
+def test_a_swap_can_be_set_from_the_command_line(file):
+    line = 'swap=[{pass=3, part="monitor.0", to="two_window"}]'
+    (swap,) = load(file(RUN), overrides=[line]).swap
+    assert swap == SwapConfig.model_validate({"pass": 3, "part": "monitor.0", "to": "two_window"})
+
+
+def one_swap(number=3, part="plan", to="morphin", **over):
+    return changed(swap=[{"pass": number, "part": part, "to": to}], **over)
+
+
+@pytest.mark.parametrize(
+    ("table", "reason"),
+    [
+        (one_swap(number=0), r"swap\.0\.pass: .*greater than or equal to 1, got 0"),
+        (one_swap(number="3"), r"swap\.0\.pass: .*got '3'"),
+        (one_swap(number=11), "a swap of plan at pass 11 is never made in a run of 10 episodes"),
+        (changed(swap=[{"part": "plan", "to": "morphin"}]), r"swap\.0\.pass: is needed and missing"),
+        (changed(swap=[{"pass": 1, "part": "plan"}]), r"swap\.0\.to: is needed and missing"),
+        (
+            changed(swap=[{"pas": 1, "part": "plan", "to": "morphin"}]),
+            r"swap\.0\.pas: no such option; did you mean 'pass'\? Legal: pass, part, to",
+        ),
+        (
+            changed(swap=[{"pass_no": 1, "pass": 1, "part": "plan", "to": "morphin"}]),
+            r"swap\.0\.pass_no: no such option; did you mean 'pass'",
+        ),
+        (one_swap(part="planner"), "unknown part 'planner'; did you mean 'plan'.*Known: analyze, learner, monitor"),
+        (one_swap(part="monitor.1"), r"swap at pass 3: unknown part 'monitor\.1'.*The run has 1 detectors"),
+        (one_swap(part="monitor", monitor={"detectors": []}), "unknown part 'monitor'"),
+        (
+            one_swap(part="monitor", monitor={"detectors": ["two_window", "two_window"]}),
+            r"unknown part 'monitor'; did you mean 'monitor\.[01]'",
+        ),
+        (one_swap(to="morfin"), "unknown planner 'morfin'; did you mean 'morphin'"),
+        (one_swap(to={"name": "morphin", "alpah": 0.1}), r"swap\(pass 3\)\.to\.alpah: no such option; .*'alpha'"),
+        (
+            one_swap(to={"name": "morphin", "schedule": {"name": "constant", "epsilon": 7}}),
+            r"swap\(pass 3\)\.to\.schedule\.epsilon: .*got 7",
+        ),
+        (one_swap(to={"name": "morphin", "schedule": 3}), r"planner 'morphin' for plan: schedule: .*got 3"),
+        (one_swap(part="monitor", to={"name": "two_window", "signal": 3}), r"signal: .*valid string, got 3"),
+        (one_swap(part="plan.schedule", to="morphin"), "unknown schedule 'morphin'"),
+        (one_swap(part="learner", to="q_learn"), "unknown learner 'q_learn'; did you mean 'q_learning'"),
+        (
+            changed(swap=[{"pass": 3, "part": "plan", "to": name} for name in ("morphin", "q_learning")]),
+            "two swaps of plan at pass 3; leave one of them",
+        ),
+        (
+            changed(swap=[{"pass": 3, "part": part, "to": "two_window"} for part in ("monitor", "monitor.0")]),
+            r"two swaps of monitor\.0 at pass 3",
+        ),
+        (changed(loops=0), "loops: .*greater than or equal to 1"),
+        (changed(loops=4097), "loops: .*less than or equal to 4096"),
+        (changed(execute={"mode": "fast"}), "mode 'fast' is not one of lockstep, free"),
+        (changed(execute={"mode": "free"}), "mode 'free' needs a rate: .*episodes per second"),
+        (changed(execute={"mode": "free", "rate": 0.0}), "greater than 0"),
+        (changed(execute={"rate": 3.0}), "rate = 3.0 paces a free-running system; in lockstep each episode waits"),
+        (changed(execute={"backlog": 0}), "backlog: .*greater than or equal to 1"),
+        (changed(system={"redrivable": "no"}), r"system\.redrivable"),
+    ],
+)
+def test_a_swap_a_number_of_loops_or_a_mode_that_is_not_legal_says_what_is(table, reason):
+    with pytest.raises(ConfigError, match=reason):
+        from_table(table, "the file")
+
+
+def test_a_swap_may_follow_another_of_the_same_part(file):
+    chosen = from_table(
+        changed(swap=[{"pass": n, "part": "plan", "to": name} for n, name in ((4, "morphin"), (2, "q_learning"))])
+    )
+    assert [(kind, spec.name) for kind, _, spec in parts_of(chosen)][-4:] == [
+        ("planner", "q_learning"),
+        ("schedule", "exponential"),
+        ("planner", "morphin"),
+        ("schedule", "exponential"),
+    ]
+
+
+def test_units_count_the_loops_of_all_trials():
+    chosen = from_table(changed(trials=3, loops=4))
+    assert chosen.units == 12
+    assert [chosen.unit(trial, loop) for trial in range(3) for loop in range(4)] == list(range(12))
+    for loop in (-1, 4):
+        with pytest.raises(ConfigError, match=f"loop {loop} is not one of the 4 loops of a trial"):
+            chosen.unit(0, loop)

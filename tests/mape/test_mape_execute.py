@@ -292,8 +292,8 @@ def test_a_remembered_table_can_be_adopted_by_its_hash(monkeypatch):
         loop.run(1)
 
 
-def execute_on(system, **arguments):
-    knowledge = Knowledge(Log(RowLayout(SIGNALS + system.signal_names, 0, 3)))
+def execute_on(system, unit=0, **arguments):
+    knowledge = Knowledge(Log(RowLayout(SIGNALS + system.signal_names, 0, 3), unit))
     sent = []
     learner = build("learner", PartSpec(name="q_learning"))
     return Execute(system, learner, knowledge, sent.append, **arguments), sent, knowledge
@@ -379,7 +379,7 @@ def test_a_signal_that_is_not_finite_is_refused_and_nothing_of_the_episode_is_le
 
 
 def test_an_observation_says_under_which_plan_the_episode_was_driven():
-    execute, sent, _ = execute_on(Corridor(), loop=4)
+    execute, sent, _ = execute_on(Corridor(), unit=4)
     execute.adopt(first_plan())
     execute.drive()
     execute.adopt(first_plan(pass_no=1, epsilon=0.25, reset_detector=True))

@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 from mape_runs import GRID, TRAFFIC, Standing, config, corridor_loop, hashes, loop_of
 
+from adapters.systems import make_system
 from knowledge import STAGES, ChangePlan, Log, RowLayout
 from mape.bus import LocalBus
 from mape.errors import BusError, ConfigError
+from mape.trials import run_trial
 
 
 @pytest.mark.parametrize("base", [GRID, TRAFFIC], ids=["gridworld", "junction"])
@@ -40,7 +42,7 @@ def test_observation_n_is_episode_n_under_plan_n_minus_1():
 @pytest.mark.parametrize("base", [GRID, TRAFFIC], ids=["gridworld", "junction"])
 def test_the_same_seed_gives_the_same_hashes_and_another_seed_trial_or_loop_another(base):
     def run(seed=0, **arguments):
-        loop = loop_of(config(base, seed=seed), **arguments)
+        loop = loop_of(config(base, seed=seed, loops=2), **arguments)
         loop.run(10)
         return hashes(loop)
 
@@ -63,7 +65,7 @@ def test_uniforms_are_the_same_stream_whether_drawn_at_once_or_pass_by_pass(monk
     whole = loop_of(config(TRAFFIC))
     whole.run(10)
     for at_once in (1, 100):
-        monkeypatch.setattr("mape.execute.component.DRAWS_AT_ONCE", at_once)
+        monkeypatch.setattr("mape.execute.uniforms.DRAWS_AT_ONCE", at_once)
         parts = loop_of(config(TRAFFIC))
         parts.run(10)
         assert hashes(parts) == hashes(whole)
@@ -125,6 +127,47 @@ def test_new_actions_reset_the_detector_before_the_next_observation():
     loop.run(6)
     assert [finished.observation.reset_detector for finished in loop.log.window] == [False] * 4 + [True, False]
     assert loop.monitor.detectors[0][1].state()["n"] == 2.0
+
+
+@pytest.mark.parametrize("engine", ["compiled", "python"])
+def test_every_loop_of_a_trial_has_a_stream_of_its_own_and_its_units_number_in_the_records(engine):
+    chosen = config(TRAFFIC, trials=2, loops=3, execute={"engine": engine})
+    found = {}
+    for trial in range(2):
+        for number in range(3):
+            loop = loop_of(chosen, trial=trial, loop=number)
+            loop.run(6)
+            found[hashes(loop)] = chosen.unit(trial, number)
+            assert {record.loop for finished in loop.log.window for record in finished} == {3 * trial + number}
+    assert list(found.values()) == list(range(6))
+
+
+def test_the_first_loop_of_each_trial_is_the_trial_without_others():
+    for trial in range(2):
+        alone = loop_of(config(trials=2), trial=trial)
+        first = loop_of(config(trials=2, loops=5), trial=trial)
+        alone.run(8)
+        first.run(8)
+        assert hashes(alone) == hashes(first)
+
+
+def test_a_trial_says_which_of_its_loops_it_ran_and_what_swaps_have_handed_over():
+    swaps = [{"pass": 2, "part": "plan", "to": "morphin"}, {"pass": 3, "part": "plan", "to": "q_learning"}]
+    result = run_trial(config(trials=2, loops=3, swap=swaps), 1, make_system, loop=2)
+    assert (result.trial, result.loop, result.handed_over) == (1, 2, (True, False))
+    assert run_trial(config(), 0, make_system)[-2:] == (0, ())
+
+
+def test_a_unit_that_fails_is_named_by_its_trial_and_loop():
+    watching = {"detectors": [{"name": "page_hinkley", "signal": "noise"}]}
+    for loops, name in ((1, "trial 1: "), (2, "trial 1, loop 0: ")):
+        with pytest.raises(ConfigError, match=f"^{name}detector"):
+            run_trial(config(trials=2, loops=loops, monitor=watching), 1, make_system)
+
+
+def test_a_free_running_config_is_refused_with_the_command_that_runs_it():
+    with pytest.raises(ConfigError, match=r"^free-running needs processes: mapek up\."):
+        loop_of(config(execute={"mode": "free", "rate": 5.0}))
 
 
 def plan(number, **fields):

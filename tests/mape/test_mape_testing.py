@@ -458,6 +458,8 @@ def spoilt(**fields):
         (corridor(n_states=0), "describes itself in numbers", "n_states is 0"),
         (corridor(max_steps=2.5), "describes itself in numbers", "max_steps is 2.5"),
         (corridor(draws=(0, -1)), "describes itself in numbers", "draws[1] is -1"),
+        (corridor(redrivable=None), "describes itself in numbers", "redrivable is None; it is True or False"),
+        (without(Corridor, member="get_state"), MEMBERS, "has no get_state()"),
         (corridor(drifts=(5, 3)), "describes itself in numbers", "increasing episodes"),
         (lambda: Corridor(signal_names=("return",)), "describes itself in numbers", "none of return, steps"),
         (lambda: Corridor(signal_names=("a", "a")), "describes itself in numbers", "distinct names"),
@@ -519,6 +521,12 @@ def test_a_system_whose_episodes_depend_on_those_before_is_noted_as_not_resumabl
     (finding,) = (f for f in check_system(Carrying) if f.check == WHATEVER)
     assert finding.verdict == "note"
     assert finding.detail.startswith("not resumable: episode")
+
+
+def test_a_system_that_cannot_be_driven_again_says_so_and_is_noted():
+    (finding,) = (f for f in check_system(corridor(redrivable=False)) if f.check == WHATEVER)
+    assert finding.verdict == "note"
+    assert finding.detail.startswith("not redrivable, as it says itself (redrivable = False)")
 
 
 def test_a_system_that_gives_and_takes_its_state_is_resumable():

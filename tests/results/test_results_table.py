@@ -104,8 +104,10 @@ def test_the_table_is_written_in_blocks_whatever_the_number_of_episodes(tmp_path
     chunk = tmp_path / "c.rows"
     rows = 8 * BLOCK
     with open(chunk, "wb") as file:
-        for _ in range(8):
-            file.write(np.zeros(BLOCK, DTYPE).tobytes())
+        for first in range(1, rows, BLOCK):
+            block = np.zeros(BLOCK, DTYPE)
+            block["episode"] = np.arange(first, first + BLOCK)
+            file.write(block.tobytes())
     tracemalloc.start()
     write_npz(tmp_path / "t.npz", [chunk], rows)
     peak = tracemalloc.get_traced_memory()[1]

@@ -1,0 +1,92 @@
+"""What a plan asks of Execute, looked at before anything of it is put in force."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from knowledge import ChangePlan, Knowledge, QTable
+from mape.errors import ManagedSystemError, PartError
+from mape.execute.rules import rate_array
+from mape.ports import Learner, ManagedSystem
+
+
+def fitting(plan: ChangePlan, known: tuple[int, ...]) -> ChangePlan:
+    """Return a plan without what other plans have done since the observation of which it was made.
+
+    In a free-running loop several plans may be made of observations that were alike; the action that the first of them
+    adds or drops is news to none of the others.
+    """
+    return plan._replace(
+        add=tuple(action for action in plan.add if action not in known),
+        drop=tuple(action for action in plan.drop if action in known),
+    )
+
+
+def checked_rate(plan: ChangePlan, learner: Learner) -> npt.NDArray[np.float64]:
+    """Return a plan's learning rate as the learner takes it.
+
+    Raises
+    ------
+    PartError
+        It has another number of parameters, or one that is not finite.
+    """
+    names = learner.rate_names
+    if len(plan.learning_rate) != len(names):
+        raise PartError(
+            f"plan {plan.pass_no} has {len(plan.learning_rate)} learning-rate parameters; the learner takes "
+            f"{len(names)}: {', '.join(names)}"
+        )
+    rates: npt.NDArray[np.float64] = rate_array(plan.learning_rate)
+    if not np.isfinite(rates).all():
+        raise PartError(f"plan {plan.pass_no} has the learning rate {plan.learning_rate}; it is of finite numbers")
+    return rates
+
+
+def table_after(
+    plan: ChangePlan, table: QTable, available: tuple[int, ...], system: ManagedSystem, knowledge: Knowledge
+) -> QTable:
+    """Return the Q-table that a plan makes of `table`, or the remembered one that it adopts.
+
+    Raises
+    ------
+    PartError
+        An action cannot be dropped, the table is not remembered or does not fit, or no action would be left.
+    """
+    try:
+        after = table.copy() if plan.adopt is None else knowledge.recall(plan.adopt)
+        after.add(plan.add)
+        after.drop(plan.drop)
+    except (LookupError, ValueError) as error:
+        raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
+    if after.n_states != system.n_states:
+        raise PartError(
+            f"plan {plan.pass_no} adopts a Q-table of {after.n_states} states; {system.name} has {system.n_states}"
+        )
+    if not set(after.actions) & {*available, *plan.enable}:
+        raise PartError(
+            f"plan {plan.pass_no} leaves a Q-table of the actions {after.actions}; {system.name} offers "
+            f"{available}, of which at least one must stay"
+        )
+    return after
+
+
+def enable(plan: ChangePlan, system: ManagedSystem) -> None:
+    """Have the system enable what a plan wants.
+
+    Raises
+    ------
+    PartError
+        The system holds no such action in reserve.
+    ManagedSystemError
+        The system raised.
+    """
+    try:
+        system.enable(plan.enable)
+    except ValueError as error:
+        raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
+    except Exception as error:
+        raise ManagedSystemError(
+            f"{system.name} raised {type(error).__name__}: {error}, while it enabled the actions "
+            f"{plan.enable} of plan {plan.pass_no}"
+        ) from error

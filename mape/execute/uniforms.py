@@ -1,0 +1,53 @@
+"""The randomness of a run: one stream of uniforms, of which each pass has a block of fixed size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+DRAWS_AT_ONCE = 8192
+"""Uniforms drawn in one go: cheaper per pass, and the same stream."""
+
+
+class Uniforms:
+    """Uniforms on [0, 1), a block per pass; the block of any pass can be found again.
+
+    Parameters
+    ----------
+    seed, key
+        Entropy and spawn key of the stream.
+    width
+        Uniforms per pass, at least 1.
+
+    Attributes
+    ----------
+    values : float64 array; the same object for good, filled anew when a pass is asked for whose block is not in it.
+
+    Examples
+    --------
+    >>> stream, again = Uniforms(7, (0, 0), 3), Uniforms(7, (0, 0), 3)
+    >>> blocks = [stream.values[at : at + 3].tolist() for at in map(stream.find, range(5000))]
+    >>> at = again.find(4321)
+    >>> again.values[at : at + 3].tolist() == blocks[4321]
+    True
+    """
+
+    def __init__(self, seed: int, key: tuple[int, ...], width: int) -> None:
+        self._width = width
+        self._held = max(1, DRAWS_AT_ONCE // width)  # passes whose blocks are held together
+        self._bits = np.random.PCG64(np.random.SeedSequence(entropy=seed, spawn_key=key))
+        self._generator = np.random.Generator(self._bits)
+        self.values = np.empty(self._held * width)
+        self._first = -self._held  # finished passes before the first block that is held
+        self._next = 0  # finished passes before the block that the generator would draw now
+
+    def find(self, passes: int) -> int:
+        """Return where in `values` the block begins of the pass that follows `passes` finished ones."""
+        turn = passes - self._first
+        if not 0 <= turn < self._held:
+            turn = passes % self._held
+            self._first = passes - turn
+            if self._first != self._next:
+                self._bits.advance((self._first - self._next) * self._width)  # a double takes one draw
+            self._generator.random(out=self.values)
+            self._next = self._first + self._held
+        return turn * self._width

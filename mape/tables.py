@@ -1,0 +1,88 @@
+"""Tables of a config: read from TOML or JSON files, laid over one another, overridden."""
+
+from __future__ import annotations
+
+import json
+import sysconfig
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from mape.errors import ConfigError
+
+Table = dict[str, Any]
+
+
+def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
+    """Read a TOML or JSON file and what it extends."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except FileNotFoundError:
+        raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in {_examples()}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise ConfigError(f"{path} is not valid {kind}: {error}") from None
+    if not isinstance(table, dict):
+        raise ConfigError(f"{path} holds no table")
+    base = table.pop("extends", None)
+    if base is None:
+        return table
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: extends = {base!r} is not the path of another config file")
+    if path.resolve() in _seen:
+        raise ConfigError(f"{path} extends itself, by way of {' -> '.join(p.name for p in _seen)}")
+    below = read_table(path.parent / base, (*_seen, path.resolve()))
+    # What a file adds to another stands for itself: the other's overlays are not its own.
+    below.pop("agents", None)
+    below.pop("profiles", None)
+    return merge(below, table)
+
+
+def _examples() -> str:
+    installed = Path(sysconfig.get_path("data"), "share", "mapek", "examples")
+    return str(installed) if installed.is_dir() else "the folder examples of the project"
+
+
+def merge(base: Table, over: Table) -> Table:
+    """Lay one table over another; see the module.
+
+    >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": {"k": 6}})
+    {'plan': {'name': 'morphin', 'k': 6}}
+    >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": "q_learning"})
+    {'plan': 'q_learning'}
+    """
+    return base | {key: _lay(base[key], value) if key in base else value for key, value in over.items()}
+
+
+def _lay(base: Any, over: Any) -> Any:
+    if isinstance(base, str) and isinstance(over, dict):
+        base = {"name": base}
+    if not isinstance(base, dict) or not isinstance(over, dict):
+        return over
+    if any(key in base and key in over and base[key] != over[key] for key in ("name", "id")):
+        return over  # another part or system: the options of the one before mean nothing to it
+    return merge(base, over)
+
+
+def parse_override(text: str) -> Table:
+    """Read ``a.b=VALUE``; VALUE is TOML, or else a string.
+
+    >>> parse_override("plan.alpha=0.2"), parse_override("plan=q_learning")
+    ({'plan': {'alpha': 0.2}}, {'plan': 'q_learning'})
+    """
+    key, equals, text_value = text.partition("=")
+    path = key.strip().split(".")
+    if not equals or not all(path):
+        raise ConfigError(f"--set {text!r} is not KEY=VALUE with a dotted key, such as plan.alpha=0.2")
+    try:
+        value = tomllib.loads(f"value = {text_value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text_value.strip()
+    for part in reversed(path):
+        value = {part: value}
+    table: Table = value
+    return table
