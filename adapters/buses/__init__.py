@@ -1,7 +1,7 @@
-"""Buses between processes."""
+"""The wire between processes: Knowledge's hub, and the members that join it."""
 
+from adapters.buses.hub import KnowledgeHub
+from adapters.buses.member import Member
 from adapters.buses.wire import Wire
-from adapters.buses.zenoh_bus import ZenohBus
-from adapters.buses.zenoh_hub import KnowledgeHub
 
-__all__ = ["KnowledgeHub", "Wire", "ZenohBus"]
+__all__ = ["KnowledgeHub", "Member", "Wire"]

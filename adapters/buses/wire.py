@@ -1,12 +1,21 @@
-"""What both ends of the wire agree on: names, places in the log, and how a session is opened.
+"""What all processes of a run agree on: who may say what under which key, and how a session is opened.
 
-    mape/<system>/<loop>/<stage>                   every record of that stage, published once it is in the log
-    mape/<system>/<loop>/knowledge/append          query: take this record
-    mape/<system>/<loop>/knowledge/since           query: what is in the log from a place on
-    mape/<system>/<loop>/alive/<name>/<session>    liveliness token, declared last
+    mape/<system>/<loop>/<role>                  records of that role's stage, published by Knowledge
+    mape/<system>/<loop>/append/<role>           query: take these records
+    mape/<system>/knowledge/join/<role>          query: I am <role>, with this config; what is my epoch?
+    mape/<system>/knowledge/since                query: the records of a loop from a pass on
+    mape/<system>/knowledge/snapshot/<role>      query: keep my state; or, without a payload, give it back
+    mape/<system>/knowledge/swapped/<role>       query: from this pass on I work with another part
+    mape/<system>/knowledge/event/<role>         query: note this beside the records
+    mape/<system>/knowledge/table                query: a Q-table, by its hash or by the pass at whose end it was
+    mape/<system>/knowledge/remember/plan        query: keep this Q-table for a later plan
+    mape/<system>/knowledge/status               query: who is there, and how far is the run?
+    mape/<system>/control/<role>                 query: answered by the role itself; replaces a part, hands out Q
+    mape/<system>/knowledge/beat/<role>          heartbeat of the thread that does the role's work
+    mape/<system>/alive/<role>/<epoch>           liveliness token, declared last
 
-A stage is named after the component that sends its records: execute (Observation), monitor (Symptom), analyze
-(ChangeRequest), plan (ChangePlan).
+A role is the component that sends a stage's records: execute (Observation), monitor (Symptom), analyze (ChangeRequest),
+plan (ChangePlan). Knowledge is the router; `operator` is a person who looks on, or replaces a part.
 """
 
 from __future__ import annotations
@@ -15,47 +24,65 @@ import json
 import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import zenoh
 
+from adapters.buses import security
 from knowledge import STAGES, ChangePlan, ChangeRequest, Observation, Record, Symptom
 from mape.errors import BusError, ConfigError
 
-STAGE_NAMES: dict[type[Record], str] = {
-    Observation: "execute",
-    Symptom: "monitor",
-    ChangeRequest: "analyze",
-    ChangePlan: "plan",
+WIRE_VERSION = 1
+"""Version of the keys and messages; processes of different ones refuse each other."""
+
+ROLES = ("execute", "monitor", "analyze", "plan")
+"""The roles beside Knowledge, in the order of their stages."""
+
+INPUT: dict[str, type[Record]] = {
+    "execute": ChangePlan,
+    "monitor": Observation,
+    "analyze": Symptom,
+    "plan": ChangeRequest,
 }
-"""Record type -> the component that sends it."""
+"""Role -> the kind of record that it waits for."""
+
+STAGE_OF: dict[str, int] = {role: stage for stage, role in enumerate(ROLES)}
+"""Role -> number of the stage whose records it sends."""
 
 ORDERED: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.DATA}
 """Put and query options. Zenoh keeps order within one priority only, and drops by default when a link is busy."""
 
 LARGEST_MESSAGE = 1 << 20
-"""Bytes of the largest record that is taken from the wire; the largest that a run can send is some tens of kB."""
+"""Bytes of the largest message without a Q-table that is taken; the largest that a run sends is some tens of kB."""
+
+LARGEST_TABLE = 1 << 30
+"""Bytes of the largest message with a Q-table that is taken."""
 
 LEASE_MS = 2_000
 """After that long a process that is frozen, or cut off, is taken for gone; one that died is seen at once."""
 
 _SEGMENT = re.compile(r"[a-z0-9_-]+")
 _UNIX = "unixsock-stream/"
-_TCP = re.compile(r"tcp/(127\.0\.0\.1|localhost|\[::1\]):(\d{1,5})")
+_NET = re.compile(r"(?:tcp|tls)/(?P<host>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):(?P<port>\d{1,5})")
+_LOOPBACK = re.compile(r"127(?:\.\d{1,3}){3}|localhost|\[::1\]")
 
 
 @dataclass(frozen=True)
 class Wire:
-    """Where one loop's records travel.
+    """Where a run's processes meet.
 
     Parameters
     ----------
     endpoint
-        ``unixsock-stream/PATH``, or ``tcp/127.0.0.1:PORT``. Plain TCP authenticates nobody, so it stays on this host.
+        ``unixsock-stream/PATH`` or ``tcp/HOST:PORT``.
     system
-        Name of the managed system; part of every key expression.
-    loop
-        Number of the loop.
+        Name of the managed system; part of every key expression. ``*`` for an operator, who asks whoever is there.
+    tls
+        Folder with certificates, as `mapek keys` makes it: both ends then prove who they are.
+    insecure
+        Allow hosts beyond this one without certificates.
 
     Raises
     ------
@@ -64,43 +91,46 @@ class Wire:
 
     Examples
     --------
-    >>> wire = Wire("tcp/127.0.0.1:7447", "gridworld", 0)
-    >>> wire.stream(Observation), wire.append
-    ('mape/gridworld/0/execute', 'mape/gridworld/0/knowledge/append')
+    >>> wire = Wire("tcp/127.0.0.1:7447", "gridworld")
+    >>> wire.stream("monitor", 0), wire.append("monitor", 0), wire.ask("since")
+    ('mape/gridworld/0/monitor', 'mape/gridworld/0/append/monitor', 'mape/gridworld/knowledge/since')
     """
 
     endpoint: str
     system: str
-    loop: int = 0
+    tls: Path | None = None
+    insecure: bool = False
 
     def __post_init__(self) -> None:
-        segment(self.system, "the system's name")
-        if self.loop < 0:
-            raise ConfigError(f"loop {self.loop}: loops are numbered from 0")
-        _check_endpoint(self.endpoint)
+        if self.system != "*":
+            segment(self.system, "the system's name")
+        _check_endpoint(self.endpoint, self.tls is not None or self.insecure)
+        if self.tls is not None and self.endpoint.startswith(_UNIX):
+            raise ConfigError(f"endpoint {self.endpoint!r} takes no keys; with --tls give tcp/HOST:PORT")
 
-    @property
-    def prefix(self) -> str:
-        """Beginning of all key expressions of the loop."""
-        return f"mape/{self.system}/{self.loop}"
+    def stream(self, role: str, loop: int | str = "*") -> str:
+        """Key on which a role's records are published."""
+        return f"mape/{self.system}/{loop}/{role}"
 
-    @property
-    def append(self) -> str:
-        """Key that takes a record to Knowledge."""
-        return f"{self.prefix}/knowledge/append"
+    def append(self, role: str, loop: int | str = "*") -> str:
+        """Key that takes a role's records to Knowledge."""
+        return f"mape/{self.system}/{loop}/append/{role}"
 
-    @property
-    def since(self) -> str:
-        """Key that asks Knowledge for records from a place on."""
-        return f"{self.prefix}/knowledge/since"
+    def ask(self, what: str) -> str:
+        """Key of a question to Knowledge."""
+        return f"mape/{self.system}/knowledge/{what}"
 
-    def stream(self, kind: type[Record]) -> str:
-        """Key on which the appended records of `kind` are published."""
-        return f"{self.prefix}/{STAGE_NAMES[kind]}"
+    def control(self, role: str) -> str:
+        """Key of a question to a role."""
+        return f"mape/{self.system}/control/{role}"
 
-    def alive(self, name: str, session: zenoh.Session) -> str:
-        """Key of the liveliness token of `name`; each session has its own, so a restart is not taken for a return."""
-        return f"{self.prefix}/alive/{segment(name, 'a component')}/{session.zid()}"
+    def beat(self, role: str) -> str:
+        """Key of a role's heartbeat."""
+        return f"mape/{self.system}/knowledge/beat/{role}"
+
+    def alive(self, role: str, epoch: int | str = "*") -> str:
+        """Key of a role's liveliness token: each start has its own, so a restart is not taken for a return."""
+        return f"mape/{self.system}/alive/{role}/{epoch}"
 
     def listen(self) -> zenoh.Session:
         """Open the meeting point: a router on the endpoint.
@@ -109,25 +139,71 @@ class Wire:
         ------
         BusError
             The endpoint is taken, or cannot be made.
+        ConfigError
+            A certificate is missing, or of no use.
         """
-        config = _config("router", listen={"endpoints": [self.endpoint]})
-        return _open(config, f"cannot listen on {self.endpoint}; is another Knowledge running there?")
+        edges: dict[str, Any] = {"listen": {"endpoints": [self._address()]}}
+        if self.tls is not None:
+            edges["access_control"] = security.access_control()
+            security.log_refusals()
+        return _open(
+            self._config("router", "knowledge", **edges),
+            f"cannot listen on {self.endpoint}; is another Knowledge running there?",
+        )
 
-    def join(self, patience: float) -> zenoh.Session:
+    def join(self, role: str, patience: float) -> zenoh.Session:
         """Open a client's session, waiting up to `patience` seconds for the meeting point.
 
         Raises
         ------
         BusError
-            Nobody listens on the endpoint.
+            Nobody listens on the endpoint, or it refuses this role's certificate.
+        ConfigError
+            A certificate is missing, or of no use.
         """
         connect = {
-            "endpoints": [self.endpoint],
+            "endpoints": [self._address()],
             "timeout_ms": max(1, round(patience * 1000)),
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
         }
-        return _open(_config("client", connect=connect), f"no Knowledge answers on {self.endpoint}; start it first")
+        otherwise = f"no Knowledge answers on {self.endpoint}; start it, or look at the address"
+        if self.tls is not None:
+            otherwise += f" and at whether it trusts the certificate of {role} in {self.tls}"
+        return _open(self._config("client", role, connect=connect), otherwise)
+
+    def _address(self) -> str:
+        return self.endpoint if self.tls is None else self.endpoint.replace("tcp/", "tls/", 1)
+
+    def _config(self, mode: str, role: str, **edges: Any) -> zenoh.Config:
+        quiet = {"enabled": False}
+        # A queue that stays full for the lease belongs to a process that is gone; Zenoh would close the link, and lose
+        # what waits, only after five seconds in which the sender is blocked.
+        blocked = {"congestion_control": {"block": {"wait_before_close": LEASE_MS * 1000}}}
+        link: dict[str, Any] = {"tx": {"lease": LEASE_MS, "queue": blocked}}
+        if self.tls is not None:
+            link |= security.tls(self.tls, role)
+        return zenoh.Config.from_json5(
+            json.dumps(
+                {
+                    "mode": mode,
+                    # Explicit endpoints only: by default two sessions on one network find each other. A router's start
+                    # would wait half a second for what may answer.
+                    "scouting": {"delay": 0, "multicast": quiet, "gossip": quiet},
+                    # Shared memory outlives a killed process, and records are far below the size at which it pays.
+                    "transport": {"shared_memory": quiet, "link": link},
+                    # No clock enters what is logged.
+                    "timestamping": quiet,
+                    **edges,
+                }
+            )
+        )
+
+
+def hand_over(queue: SimpleQueue[Any], kind: str) -> zenoh.handlers.Callback[Any]:
+    """Return a handler that puts what arrives into `queue`, as (kind, what); whoever works takes it from there."""
+    put = queue.put
+    return zenoh.handlers.Callback(lambda what: put((kind, what)), indirect=False)
 
 
 def segment(text: str, what: str) -> str:
@@ -143,28 +219,21 @@ def segment(text: str, what: str) -> str:
     return text
 
 
-def place(record: Record) -> int:
-    """Return the place of a record in the log: 0 for plan 0, then the four records of pass 1, of pass 2, ...
+def system_segment(identifier: str) -> str:
+    """Turn a system's id into a segment of a key expression.
 
-    >>> place(ChangePlan(0, 0, 1.0, (), (), (), (), False, None))
-    0
-    >>> place(ChangePlan(0, 2, 1.0, (), (), (), (), False, None))
-    8
+    >>> system_segment("mapek/Gridworld-v0")
+    'mapek-gridworld-v0'
     """
-    return len(STAGES) * (record.pass_no - 1) + STAGES.index(type(record)) + 1
+    return segment(re.sub(r"[^a-z0-9_-]+", "-", identifier.lower()).strip("-"), "the system's name")
 
 
-def at_place(number: int) -> tuple[int, int]:
-    """Return the pass and the stage of place `number`: the inverse of `place`.
-
-    >>> at_place(0), at_place(1), at_place(8)
-    ((0, 3), (1, 0), (2, 3))
-    """
-    before, stage = divmod(number - 1, len(STAGES))
-    return before + 1, stage
+def role_of(kind: type[Record]) -> str:
+    """Return the role that sends records of `kind`."""
+    return ROLES[STAGES.index(kind)]
 
 
-def _check_endpoint(endpoint: str) -> None:
+def _check_endpoint(endpoint: str, anywhere: bool) -> None:
     if endpoint.startswith(_UNIX):
         path = endpoint.removeprefix(_UNIX)
         if not path or re.search(r"[?#;]", path):
@@ -172,31 +241,18 @@ def _check_endpoint(endpoint: str) -> None:
         if (size := len(os.fsencode(path))) >= 108:
             raise ConfigError(f"the socket's path {path!r} has {size} bytes; the kernel takes fewer than 108")
         return
-    found = _TCP.fullmatch(endpoint)
-    if found is None or not 1 <= int(found[2]) <= 65_535:
+    found = _NET.fullmatch(endpoint)
+    if found is None or not 1 <= int(found["port"]) <= 65_535:
         raise ConfigError(
-            f"endpoint {endpoint!r} is neither {_UNIX}PATH nor tcp/127.0.0.1:PORT with a port from 1 to 65535; plain "
-            "TCP authenticates nobody, so it is kept to this host"
+            f"endpoint {endpoint!r} is neither {_UNIX}PATH nor tcp/HOST:PORT with a port from 1 to 65535, such as "
+            "tcp/127.0.0.1:7447"
         )
-
-
-def _config(mode: str, **edges: Any) -> zenoh.Config:
-    quiet = {"enabled": False}
-    return zenoh.Config.from_json5(
-        json.dumps(
-            {
-                "mode": mode,
-                # Explicit endpoints only: by default two sessions on one network find each other. A router's start
-                # would wait half a second for what may answer.
-                "scouting": {"delay": 0, "multicast": quiet, "gossip": quiet},
-                # Shared memory outlives a killed process, and records are far below the size at which it pays.
-                "transport": {"shared_memory": quiet, "link": {"tx": {"lease": LEASE_MS}}},
-                # No clock enters what is logged.
-                "timestamping": quiet,
-                **edges,
-            }
+    if not anywhere and not _LOOPBACK.fullmatch(found["host"]):
+        raise ConfigError(
+            f"endpoint {endpoint!r} can be reached from other machines, and without keys nobody proves who they are. "
+            "Make keys with `mapek keys DIR` and give --tls DIR; or stay on 127.0.0.1; or, where the network itself is "
+            "trusted, give --insecure"
         )
-    )
 
 
 def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:

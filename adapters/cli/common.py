@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ def open_folder(
     name: str,
     configs: Mapping[str, Config],
     trace: tuple[int, int] | None = None,
+    check: Callable[[Config], object] = check,
 ) -> RunFolder:
     """Open the folder that the command line names, or a new one, and say if it is continued.
 
@@ -57,10 +59,30 @@ def open_folder(
     for agent, config in configs.items():
         check_name(agent)
         check(config)
-    folder = RunFolder(Path(chosen.out) if chosen.out else default_path(name), kind, configs, trace)
+    path = Path(chosen.out) if chosen.out else default_path(name)
+    folder = RunFolder(path, kind, configs, trace, chosen.arguments)
     if folder.resumed:
         say(chosen, f"continuing in {folder.path}: {folder.resumed} trials are finished already")
     return folder
+
+
+@contextlib.contextmanager
+def operator(chosen: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
+    """Join a run as a person who looks on; yield the session and the wire.
+
+    Raises
+    ------
+    BusError
+        Nobody listens there.
+    """
+    from adapters.buses.wire import Wire
+
+    wire = Wire(chosen.connect, "*", None if chosen.tls is None else Path(chosen.tls), chosen.insecure)
+    session = wire.join("operator", 3.0)
+    try:
+        yield session, wire
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
 
 
 def check_name(agent: str) -> None:

@@ -81,6 +81,119 @@ def parser() -> argparse.ArgumentParser:
         "--from", dest="first", type=_positive, default=1, metavar="PASS", help="run up to this pass first"
     )
 
+    up = commands.add_parser(
+        "up",
+        help="run a config as five processes, watched and restarted",
+        description="Run a config as five processes on this machine: Knowledge, Monitor, Analyze, Plan, Execute. They "
+        "are watched, and started again when they die; what comes out is what `mapek run` gives, bit for bit.",
+    )
+    up.add_argument("config", metavar="CONFIG", help="TOML file, or the config-*.json of an earlier run")
+    up.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
+    _overlays(up)
+    up.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions, side by side")
+    up.add_argument("--listen", metavar="ENDPOINT", help="where they meet (default: a socket in a temporary folder)")
+    _where_to(up)
+    _keeps(up)
+    up.add_argument(
+        "--hang-after", type=_seconds, default=60.0, metavar="S",
+        help="restart a process that is alive and silent for so long; longer than an episode takes (default 60)",
+    )  # fmt: skip
+    _secure(up)
+
+    serve = commands.add_parser(
+        "serve",
+        help="one process of a run, here or on another machine",
+        description="Be one process of a run. Start the five in any order, on as many machines as you like.",
+    )
+    serve.add_argument("config", metavar="CONFIG", help="the same file and options for all processes")
+    serve.add_argument("--role", required=True, choices=["knowledge", "monitor", "analyze", "plan", "execute"])
+    serve.add_argument("--listen", metavar="ENDPOINT", help="knowledge: such as tcp/127.0.0.1:7447")
+    serve.add_argument("--connect", metavar="ENDPOINT", help="the others: where Knowledge listens")
+    serve.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
+    _overlays(serve)
+    serve.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions, side by side")
+    _where_to(serve)
+    _keeps(serve)
+    _secure(serve)
+    serve.add_argument("--log", metavar="FILE", help=argparse.SUPPRESS)
+    serve.add_argument("--leash", action="store_true", help=argparse.SUPPRESS)
+
+    status = commands.add_parser("status", help="who is there, and how far a run is", description="Look at a run.")
+    status.add_argument("--connect", required=True, metavar="ENDPOINT", help="where Knowledge listens")
+    status.add_argument("--json", action="store_true", help="as JSON")
+    _secure(status)
+
+    swap = commands.add_parser(
+        "swap",
+        help="replace a part of a running loop",
+        description="Replace a part of a running loop at the boundary of a pass. What does not keep the contract of "
+        "its kind, or fails at its first pass, is refused, and the old part goes on.",
+    )
+    swap.add_argument("part", metavar="PART", help="monitor, monitor.K, analyze, plan, plan.schedule or learner")
+    swap.add_argument(
+        "to", metavar="TO", help="short name, module:Class, or a table such as '{name = \"morphin\", alpha = 0.2}'"
+    )
+    swap.add_argument("--connect", required=True, metavar="ENDPOINT", help="where Knowledge listens")
+    _secure(swap)
+
+    log = commands.add_parser(
+        "log",
+        help="the records of a run, from its folder",
+        description="Print the records that a run of `mapek up` or `mapek serve` has logged, finished or not.",
+    )
+    log.add_argument("folder", metavar="DIR", help="folder of the run, or its log.sqlite")
+    log.add_argument("--pass", dest="passes", type=_span, metavar="N|FROM:TO", help="only these passes")
+    log.add_argument("--stage", choices=["observation", "symptom", "request", "plan"], help="only this kind of record")
+    log.add_argument("--loop", type=_natural, metavar="L", help="only this loop, by its number in the records")
+    log.add_argument("--events", action="store_true", help="what happened beside the records too: who joined, ...")
+    log.add_argument("--follow", action="store_true", help="go on until the run is complete, or Ctrl-C")
+    log.add_argument("--json", action="store_true", help="JSON lines: each record as it stands in the log")
+
+    replay = commands.add_parser(
+        "replay",
+        help="derive a run again and compare it with what is on disk",
+        description="Derive each record of a log again (`mapek up`, `mapek serve`), or run the trials of a folder of "
+        "tables again (`mapek run`, `compare`, `reproduce`), and name the first difference.",
+    )
+    replay.add_argument("folder", metavar="DIR", help="folder of the run, or its log.sqlite")
+    replay.add_argument(
+        "--to", type=_positive, metavar="PASS", help="stop after this pass, and show what Knowledge then held"
+    )
+    replay.add_argument("--loop", type=_natural, metavar="L", help="only this loop, by its number in the records")
+    replay.add_argument("--json", action="store_true", help="as JSON; with --to the whole Q-table is in it")
+    _how(replay)
+
+    resume = commands.add_parser(
+        "resume",
+        help="continue an unfinished run, whatever command began it",
+        description="Continue an unfinished run by the command that began it, in the folder where it was given.",
+    )
+    resume.add_argument("folder", metavar="DIR", help="folder of the run")
+    _how(resume)
+
+    keys = commands.add_parser(
+        "keys",
+        help="make a private CA and the certificates of all roles",
+        description="Make a private certificate authority and one certificate per role, for --tls DIR.",
+    )
+    keys.add_argument("folder", metavar="DIR")
+    keys.add_argument(
+        "--host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="name or address of Knowledge's machine (repeatable)",
+    )
+    keys.add_argument("--days", type=_positive, default=365, metavar="N", help="validity (default 365)")
+    keys.add_argument("--renew", metavar="ROLE", help="make this role's certificate anew, with the CA that is there")
+
+    schema = commands.add_parser(
+        "schema",
+        help="the wire as an AsyncAPI document: every key expression and message",
+        description="Print the AsyncAPI 3.0 document of the wire, generated from the code.",
+    )
+    schema.add_argument("--out", metavar="FILE", help="write it there instead")
+
     commands.add_parser("list", help="systems, detectors, planners, schedules, learners: one line each")
 
     check = commands.add_parser(
@@ -96,10 +209,12 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     top = parser()
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         chosen = top.parse_args(arguments)
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
+    chosen.arguments = arguments  # which the folder of a run keeps, for `mapek resume`
     if chosen.version:
         from adapters.results.folder import versions
 
@@ -109,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         top.print_help()
         return 2
     try:
-        code = _dispatch(chosen)
+        code = dispatch(chosen)
         sys.stdout.flush()  # here, where what goes wrong can still be said
         return code
     except KeyboardInterrupt:
@@ -128,7 +243,8 @@ def _silence() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _dispatch(chosen: argparse.Namespace) -> int:
+def dispatch(chosen: argparse.Namespace) -> int:
+    """Run the command that was chosen; return its exit code."""
     import importlib
 
     if (sentence := _shadowed()) is not None:
@@ -187,11 +303,49 @@ def _what_runs(command: argparse.ArgumentParser) -> None:
     command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one per core)")
 
 
+def _how(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one per core)")
+    command.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+
+
 def _where_to(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", metavar="DIR", help="new folder, or that of an unfinished run to be continued")
     command.add_argument("--json", metavar="FILE", help="write the result as JSON too; - for standard output")
     command.add_argument("--no-figures", action="store_true", help="leave the figures out")
     command.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+
+
+def _keeps(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--durability", choices=["normal", "full"], default="normal",
+        help="what is acknowledged outlives the process (normal), or a loss of power too (full, slower)",
+    )  # fmt: skip
+    command.add_argument(
+        "--snapshot-every",
+        type=_positive,
+        default=100,
+        metavar="N",
+        help="passes between two kept states (default 100)",
+    )
+
+
+def _secure(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--tls", metavar="DIR", help="keys as `mapek keys DIR` makes them: everybody proves who they are"
+    )
+    command.add_argument(
+        "--insecure", action="store_true", help="allow other machines without keys, where the network is trusted"
+    )
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0.1 <= seconds < 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds of at least 0.1")
+    return seconds
 
 
 def _positive(text: str) -> int:

@@ -1,116 +1,79 @@
-"""A short run of the four components, each on a bus of its own or all on one; also a program, for two processes.
+"""A short run of the four components, as a `Loop` in this process and as roles over the wire."""
 
-    python bus_small_loop.py managing ENDPOINT    Knowledge, Monitor and Analyze
-    python bus_small_loop.py managed ENDPOINT     Plan and Execute
-
-Each prints the hash of the log that it holds.
-"""
-
-import sys
+import json
+import threading
 from pathlib import Path
 
-from adapters.buses import KnowledgeHub, Wire, ZenohBus
+from adapters.buses import KnowledgeHub, Member
+from adapters.buses.hub import versions
+from adapters.processes.role import make_role
+from adapters.processes.serve import open_ledger
 from adapters.systems import make_system
-from knowledge import STAGES, ChangePlan, ChangeRequest, Knowledge, Log, Observation, Symptom
-from mape import registry
-from mape.analyze import Analyze
 from mape.config import load
-from mape.execute import Execute
-from mape.loop import Loop, layout_of
-from mape.monitor import Monitor
-from mape.plan import Plan
+from mape.loop import Loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "gridworld_goals.toml"
-EPISODES = 20
-SYSTEM = "gridworld_goals"
 
 
-def small_config():
+def small_config(episodes=20, **options):
     """Return the example with its goals swapped early, and a detector that alarms at once."""
     detector = '{ name = "page_hinkley", signal = "return", delta = 0.5, threshold = 30.0 }'
     return load(
         EXAMPLE,
         overrides=[
-            f"episodes={EPISODES}",
+            f"episodes={episodes}",
             "execute.engine=python",
             "system.options.switch_at=[6, 11]",
             f"monitor.detectors=[{detector}]",
+            *[f"{name}={value}" for name, value in options.items()],
         ],
     )
 
 
-def new_log(config):
+def in_process(config, loop=0):
+    """Run it over a `LocalBus`; return the loop."""
     system = make_system(config.system)
-    try:
-        return Log(layout_of(config, system))
-    finally:
-        system.close()
-
-
-def in_process():
-    """Run it as a `Loop`; return its log."""
-    config = small_config()
-    system = make_system(config.system)
-    loop = Loop(config, system)
-    loop.run(config.episodes)
+    one = Loop(config, system, loop=loop)
+    one.run(config.episodes)
     system.close()
-    return loop.log
+    return one
 
 
-def add_monitor(bus, config):
-    detectors = [(spec.signal, registry.build("detector", spec)) for spec in config.monitor.detectors]
-    bus.subscribe(Observation, Monitor(detectors, bus.send).on_observation)
+class Distributed:
+    """Knowledge and the four roles, each role on a thread of its own."""
 
+    def __init__(self, config, wire, path):
+        self.config, self.wire, self.path = config, wire, path
+        self.failed = []
+        self.threads = []
+        self.roles = {}
 
-def add_analyze(bus, config):
-    bus.subscribe(Symptom, Analyze(registry.build("analyzer", config.analyze), bus.send).on_symptom)
+    def open(self):
+        self.ledger = open_ledger(self.config, self.path, "normal")
+        self.hub = KnowledgeHub(self.ledger, self.wire, json.loads(self.config.to_json()), versions(), 5)
+        self.hub.connect()
 
+    def start(self, name):
+        def member_of(layout):
+            config = json.loads(self.config.to_json())
+            return Member(self.wire, name, config=config, versions=versions(), layout=layout, patience=20)
 
-def add_plan(bus, config, knowledge):
-    schedule = registry.build("schedule", config.plan.schedule)
-    plan = Plan(registry.build("planner", config.plan, schedule=schedule), knowledge, bus.send)
-    bus.subscribe(ChangeRequest, plan.on_request)
-    return plan
+        role = self.roles[name] = make_role(name, self.config, member_of)
 
+        def run():
+            try:
+                role.run()
+            except Exception as error:
+                self.failed.append(error)
 
-def add_execute(bus, config, knowledge, system):
-    learner = registry.build("learner", config.learner)
-    execute = Execute(system, learner, knowledge, bus.send, seed=config.seed, engine=config.execute.engine)
-    bus.subscribe(ChangePlan, execute.adopt)
-    return execute
+        self.threads.append(threading.Thread(target=run, name=name))
+        self.threads[-1].start()
 
+    def join(self):
+        for thread in self.threads:
+            thread.join(40)
+        assert self.failed == []
 
-def managing(wire):
-    config = small_config()
-    plans = []
-    with KnowledgeHub(new_log(config), wire) as hub, ZenohBus(wire, "managing") as bus:
-        add_monitor(bus, config)
-        add_analyze(bus, config)
-        bus.subscribe(ChangePlan, plans.append)
-        bus.run_until(lambda: bool(plans) and plans[-1].pass_no == EPISODES, timeout=30)
-    return hub.log
-
-
-def managed(wire):
-    config = small_config()
-    mirror = new_log(config)
-    system = make_system(config.system)
-    bus = ZenohBus(wire, "managed", patience=20)
-    for kind in STAGES:
-        bus.subscribe(kind, mirror.append)
-    knowledge = Knowledge(mirror)
-    plan = add_plan(bus, config, knowledge)
-    execute = add_execute(bus, config, knowledge, system)
-    with bus:
-        plan.start(0)
-        for number in range(EPISODES + 1):
-            bus.run_until(lambda number=number: execute.plan is not None and execute.plan.pass_no == number, timeout=30)
-            if number < EPISODES:
-                execute.drive()
-    system.close()
-    return mirror
-
-
-if __name__ == "__main__":
-    role = {"managing": managing, "managed": managed}[sys.argv[1]]
-    print(role(Wire(sys.argv[2], SYSTEM)).sha256())
+    def close(self):
+        self.hub.close()
+        self.ledger.store.close()

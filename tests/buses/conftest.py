@@ -6,7 +6,7 @@ import pytest
 
 from adapters.buses import Wire
 
-# pytest imports test modules without a path to their neighbours; `bus_records` and `bus_small_loop` are such.
+# pytest imports test modules without a path to their neighbours; `bus_records` and `bus_peers` are such.
 sys.path.append(str(Path(__file__).parent))
 
 

@@ -1,0 +1,587 @@
+"""A role's end of the wire: what it sends is appended once, what it is to see comes in order, once."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from queue import Empty, SimpleQueue
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import zenoh
+
+from adapters.buses.hub import SINCE_LIMIT, host
+from adapters.buses.messages import Beat, Control, Dropped, Happened, Join, Joined, Layout, State, Swapped, Table
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, STAGE_OF, Wire, hand_over
+from knowledge import STAGES, MalformedRecord, QTable, Record, from_json, to_json
+from mape.errors import BusError
+
+logger = logging.getLogger(__name__)
+
+SILENCE = 0.3
+"""Seconds without a publication after which Knowledge is asked whether one was missed."""
+
+ANSWER_WITHIN = 2.0
+"""Seconds after which a question counts as lost, and is asked again."""
+
+RESEND_AFTER = 0.5
+"""Seconds without an acknowledgement after which a record is sent again."""
+
+REPEAT_AFTER = 0.05
+"""The same, where Knowledge says that a record before another is missing."""
+
+RESENT_AT_ONCE = 64
+"""Most records of a loop that are sent again together."""
+
+KEEP_UP_EVERY = 0.1
+"""Seconds between two looks at what is outstanding."""
+
+DEAF_AFTER = 4.0
+"""Seconds of nothing but lost questions after which a session whose link stands is given up for a new one."""
+
+BEAT_EVERY = 0.5
+"""Seconds between two heartbeats."""
+
+
+class Refused(BusError):
+    """Knowledge said no; to ask again would not change it."""
+
+
+class Asked(NamedTuple):
+    """A question to this role; answer it by `Member.answer` or `Member.refuse`."""
+
+    query: zenoh.Query
+    control: Control
+
+
+_UNHEARD: Any = zenoh.handlers.Callback(lambda reply: None, indirect=False)
+
+
+class _Sent(NamedTuple):
+    number: int
+    payload: bytes
+    attachment: bytes
+    at: float
+
+
+class Member:
+    """One role's link to Knowledge, for all loops of the run.
+
+    Nothing rests on delivery. A record is sent until Knowledge has acknowledged it, which appends it once however often
+    it comes; the acknowledgement is not waited for. What is published is taken if it bears Knowledge's seal and is the
+    next of its loop; where one was missed, where nothing comes for a while, and at the start, Knowledge is asked for
+    what the log holds from there on.
+
+    Constructing does no I/O. `connect`, then `watch`, `send`, `receive`, `close`; all on one thread.
+
+    Parameters
+    ----------
+    wire
+        Where Knowledge listens.
+    role
+        What this is: execute, monitor, analyze or plan.
+    config, versions
+        What Knowledge compares with its own.
+    layout
+        Execute's word on what the rows of the run hold; None from the other roles, which wait for it.
+    patience
+        Seconds that Knowledge may be away before a BusError; None waits for ever.
+    waiting
+        Told, as a sentence, for whom this role waits.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        role: str,
+        *,
+        config: Mapping[str, Any] | None = None,
+        versions: Mapping[str, str] | None = None,
+        layout: Layout | None = None,
+        patience: float | None = None,
+        waiting: Callable[[str], object] = lambda sentence: None,
+    ) -> None:
+        self.wire = wire
+        self.role = role
+        self.patience = patience
+        self.joined = Joined(epoch=0, seal="", units=0, layout=None, last=(), swaps=())
+        self.refused = 0
+        self.passes = 0  # for the heartbeat: what all loops together have done
+        self._config, self._versions, self._layout = dict(config or {}), dict(versions or {}), layout
+        self._tell = waiting
+        self._told = ""
+        self._input = STAGES.index(INPUT[role])
+        self._arrived: SimpleQueue[Any] = SimpleQueue()  # filled by Zenoh's threads, and by nobody else
+        self._waiting: deque[Record | Asked] = deque()
+        self._next: dict[int, int] = {}  # loop -> pass of the next record that is waited for
+        self._sent: dict[int, deque[_Sent]] = {}
+        self._kept: dict[int, int] = {}  # loop -> number of the last record of this stage that Knowledge has
+        self._heard: dict[int, float] = {}  # when something of a loop came last, or was asked for
+        self._fetched: set[int] = set()  # loops of which an answer is awaited
+        self._kept_up_at = self._beat_at = 0.0
+        self._deaf_since: float | None = None  # the first question that was lost, of those since the last answer
+        self._session: zenoh.Session | None = None
+        self._seal = b""
+        self._epoch = b""
+        self._leave: Callable[..., object] | None = None
+
+    # Coming and going.
+
+    def connect(self) -> None:
+        """Join the run; waits for Knowledge, and for an Execute that tells the layout.
+
+        Raises
+        ------
+        BusError
+            Nobody was there within the patience; or Knowledge refuses this role, and says why.
+        """
+        deadline = None if self.patience is None else time.monotonic() + self.patience
+        self._attach(self._open(deadline), lambda: self._join(deadline))
+
+    def _attach(self, session: zenoh.Session, join: Callable[[], object]) -> None:
+        with ExitStack() as opened:
+            self._session = session
+            opened.callback(session.close)
+            streams = self.wire.stream(ROLES[self._input])
+            opened.callback(session.declare_subscriber(streams, hand_over(self._arrived, "record")).undeclare)
+            opened.callback(
+                session.declare_queryable(self.wire.control(self.role), hand_over(self._arrived, "control")).undeclare
+            )
+            self._on_ack, self._on_since = hand_over(self._arrived, "ack"), hand_over(self._arrived, "since")
+            self._beats = session.declare_publisher(self.wire.beat(self.role), **ORDERED)
+            join()
+            # Last: who sees the token knows that all else stands.
+            token = session.liveliness().declare_token(self.wire.alive(self.role, self.joined.epoch))
+            opened.callback(token.undeclare)
+            # At the latest at the interpreter's exit: a Zenoh thread that then still calls Python aborts the process.
+            self._leave = weakref.finalize(self, opened.pop_all().close)
+        self.beat()
+
+    def close(self) -> None:
+        """Leave; what was not acknowledged may be lost, unless `settle` was called."""
+        if self._leave is not None:
+            self._leave()
+        self._session = None
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self, deadline: float | None) -> zenoh.Session:
+        while True:
+            try:
+                return self.wire.join(self.role, 0.5)
+            except BusError:
+                if deadline is not None and time.monotonic() > deadline:
+                    raise
+                self._say(f"waiting for Knowledge on {self.wire.endpoint}")
+
+    def _join(self, deadline: float | None) -> None:
+        join = Join(
+            role=self.role, config=self._config, versions=self._versions, pid=os.getpid(), host=host(),
+            layout=self._layout,
+        ).pack()  # fmt: skip
+        pause = threading.Event()
+        while True:
+            self.joined, _ = Joined.unpack(self.ask(f"join/{self.role}", join, deadline=deadline))
+            if self.joined.layout is not None:
+                break
+            if deadline is not None and time.monotonic() > deadline:
+                raise BusError(f"{self.role} waited in vain for an Execute to tell what its system's signals are")
+            self._say("waiting for Execute, which has the managed system")
+            pause.wait(0.05)
+        self._seal = self.joined.seal.encode()
+        self._epoch = str(self.joined.epoch).encode()
+
+    def _lost(self) -> None:
+        """Take note that a question was lost; where all are, and yet the link stands, open another session.
+
+        A process that was frozen while much was sent to it may come back before the router has taken its old link down;
+        through the new one nothing then passes, for ever (https://github.com/eclipse-zenoh/zenoh/issues/1886).
+        """
+        now = time.monotonic()
+        self._deaf_since = now if self._deaf_since is None else self._deaf_since
+        session, leave = self._session, self._leave
+        if now - self._deaf_since < DEAF_AFTER or session is None or leave is None:
+            return
+        self._deaf_since = None
+        if not session.info.routers_zid():
+            return  # Zenoh itself connects again
+        try:
+            another = self.wire.join(self.role, 0.5)
+        except BusError:
+            return
+        logger.warning("%s hears nothing from Knowledge, and opens another session", self.role)
+        leave()
+        self._fetched.clear()
+        self._attach(another, lambda: None)
+
+    def _say(self, sentence: str) -> None:
+        if sentence != self._told:
+            self._told = sentence
+            self._tell(sentence)
+
+    # Sending.
+
+    def send(self, record: Record, state: bytes = b"") -> None:
+        """Have `record` appended; it is sent again until Knowledge has acknowledged it.
+
+        Parameters
+        ----------
+        record
+            The next one of its loop.
+        state
+            A packed `State` that is written together with the record.
+
+        Raises
+        ------
+        BusError
+            It cannot be written as JSON. A refusal by Knowledge comes out of a later `receive` or `settle`.
+        """
+        try:
+            payload = to_json(record)
+        except MalformedRecord as error:
+            raise BusError(
+                f"{type(record).__name__} {record.pass_no} cannot be written for the wire: {error}"
+            ) from error
+        self._submit(record.loop, record.pass_no, payload, self._epoch + b"\n" + state if state else self._epoch)
+
+    def drop(self, loop: int, first: int, last: int) -> None:
+        """Say that episodes of a free-running loop will not be logged."""
+        self._submit(loop, last, Dropped(loop=loop, first=first, last=last).pack(), self._epoch)
+
+    def unacknowledged(self, loop: int) -> int:
+        """Return how many records of a loop were sent and not acknowledged yet."""
+        return len(self._sent.get(loop, ()))
+
+    def settle(self, timeout: float | None = None) -> None:
+        """Wait until all that was sent is acknowledged; what comes meanwhile is kept for `receive`.
+
+        Raises
+        ------
+        BusError
+            It was refused, or Knowledge does not answer within `timeout` seconds, or within the patience.
+        """
+        timeout = self.patience if timeout is None else timeout
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while any(self._sent.values()):
+            left = SILENCE if deadline is None else min(SILENCE, deadline - time.monotonic())
+            if left <= 0:
+                raise BusError(f"Knowledge on {self.wire.endpoint} did not acknowledge what {self.role} sent in time")
+            self._take_in(min(left, KEEP_UP_EVERY))
+            self._keep_up(time.monotonic())
+
+    def _submit(self, loop: int, number: int, payload: bytes, attachment: bytes) -> None:
+        waiting = self._sent.get(loop)
+        if waiting is None:
+            waiting = self._sent[loop] = deque()
+        waiting.append(_Sent(number, payload, attachment, time.monotonic()))
+        self._transmit(loop, payload, attachment)
+
+    def _transmit(self, loop: int, payload: bytes, attachment: bytes) -> None:
+        session = self._session
+        if session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        session.get(
+            self.wire.append(self.role, loop), self._on_ack, payload=payload, attachment=attachment,
+            timeout=ANSWER_WITHIN, **ORDERED,
+        )  # fmt: skip
+
+    def _acknowledged(self, reply: zenoh.Reply) -> None:
+        ok = reply.ok
+        if ok is None:
+            self._unanswered(reply)
+            return
+        self._deaf_since = None
+        answer = json.loads(ok.payload.to_bytes())
+        loop = int(str(ok.key_expr).split("/")[2])
+        waiting, last = self._sent.get(loop), answer["last"]
+        kept = self._kept.get(loop, self.joined.last[loop][STAGE_OF[self.role]])
+        if last < kept:
+            kind = STAGES[STAGE_OF[self.role]].__name__
+            raise Refused(
+                f"Knowledge had {kind} {kept} of loop {loop} from {self.role}, and has them up to {last} only. Was it "
+                "started anew with an older log?"
+            )
+        self._kept[loop] = last
+        while waiting and waiting[0].number <= last:
+            waiting.popleft()
+        if not waiting:
+            return
+        # One that was lost lets all behind it come too early; they are not answered by as many repetitions.
+        if time.monotonic() - waiting[0].at > (REPEAT_AFTER if answer["ack"] == "gap" else RESEND_AFTER):
+            self._send_again(loop)
+
+    def _unanswered(self, reply: zenoh.Reply) -> None:
+        said = reply.err.payload.to_string() if reply.err is not None else "Timeout"
+        if said != "Timeout":  # Zenoh's own word; everything else was said by Knowledge
+            raise Refused(f"{self.role} is refused by Knowledge: {said}")
+        self._lost()
+
+    def _send_again(self, loop: int) -> None:
+        now = time.monotonic()
+        waiting = self._sent[loop]
+        for i in range(min(len(waiting), RESENT_AT_ONCE)):
+            waiting[i] = waiting[i]._replace(at=now)
+            self._transmit(loop, waiting[i].payload, waiting[i].attachment)
+
+    # Receiving.
+
+    def watch(self, loop: int, number: int) -> None:
+        """Receive the records of `loop` from pass `number` on, those that are in the log already first."""
+        self._next[loop] = number
+        self._fetch(loop)
+
+    def unwatch(self, loop: int) -> None:
+        """Receive no more of `loop`."""
+        self._next.pop(loop, None)
+        self._heard.pop(loop, None)
+
+    def receive(self, timeout: float) -> Record | Asked | None:
+        """Return the next record, or question to this role; None where neither came within `timeout` seconds.
+
+        Raises
+        ------
+        BusError
+            Knowledge refused what was sent, does not answer, or has another log than before.
+        """
+        deadline = time.monotonic() + timeout
+        looked = False
+        while True:
+            now = time.monotonic()
+            if now >= self._beat_at:
+                self.beat(waiting=not self._waiting)
+            if now >= self._kept_up_at:
+                self._keep_up(now)
+            if self._waiting:
+                return self._waiting.popleft()
+            left = deadline - now
+            if looked and left < 0:
+                return None
+            self._take_in(min(left, KEEP_UP_EVERY))
+            looked = True
+
+    def _take_in(self, timeout: float) -> None:
+        """Take what Zenoh's threads have put down, waiting for the first of it."""
+        try:
+            kind, what = self._arrived.get(timeout=max(0.0, timeout))
+            while True:
+                if kind == "record":
+                    self._hear(what)
+                elif kind == "ack":
+                    self._acknowledged(what)
+                elif kind == "since":
+                    self._caught_up(what)
+                else:
+                    self._questioned(what)
+                kind, what = self._arrived.get_nowait()
+        except Empty:
+            return
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        try:
+            if len(sample.payload) > LARGEST_MESSAGE:
+                raise MalformedRecord(f"a publication of {len(sample.payload)} bytes")
+            seal = sample.attachment
+            if seal is None or seal.to_bytes() != self._seal:
+                raise MalformedRecord("a publication that does not bear Knowledge's seal")
+            record = from_json(sample.payload.to_bytes())
+            if type(record) is not STAGES[self._input]:
+                raise MalformedRecord(f"a {type(record).__name__}, which {self.role} does not take")
+        except MalformedRecord as error:
+            self._ignore(f"{sample.key_expr}: {error}")
+            return
+        expected = self._next.get(record.loop)
+        if expected is None or record.pass_no < expected:
+            return
+        if record.pass_no > expected:
+            self._fetch(record.loop)
+            return
+        self._next[record.loop] = expected + 1
+        self._heard[record.loop] = time.monotonic()
+        self._waiting.append(record)
+
+    def _ignore(self, why: str) -> None:
+        self.refused += 1
+        logger.warning("%s ignores %s", self.role, why[:300])
+
+    def _questioned(self, query: zenoh.Query) -> None:
+        try:
+            payload = query.payload
+            if payload is None or len(payload) > LARGEST_MESSAGE:
+                raise MalformedRecord(f"a question to {self.role} carries a Control message")
+            control, _ = Control.unpack(payload.to_bytes())
+        except MalformedRecord as error:
+            self._ignore(f"a question: {error}")
+            self.refuse(query, str(error))
+            return
+        self._waiting.append(Asked(query, control))
+
+    def _keep_up(self, now: float) -> None:
+        """Send again what was not acknowledged, and ask for what may have been missed."""
+        self._kept_up_at = now + KEEP_UP_EVERY
+        for loop, waiting in self._sent.items():
+            if waiting and now - waiting[0].at > RESEND_AFTER:
+                self._send_again(loop)
+        for loop in self._next:
+            silent = now - self._heard.get(loop, 0.0)
+            if silent > (ANSWER_WITHIN if loop in self._fetched else SILENCE):
+                self._fetched.discard(loop)
+                self._fetch(loop)
+
+    def _fetch(self, loop: int) -> None:
+        # The answer is not waited for: a managed system that runs freely does not stand still for it.
+        if loop in self._fetched:
+            return
+        self._fetched.add(loop)
+        self._heard[loop] = time.monotonic()
+        if self._session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        self._session.get(
+            f"{self.wire.ask('since')}?loop={loop};from={self._input}:{self._next[loop]}", self._on_since,
+            timeout=ANSWER_WITHIN, **ORDERED,
+        )  # fmt: skip
+
+    def _caught_up(self, reply: zenoh.Reply) -> None:
+        if reply.ok is None:
+            self._unanswered(reply)
+            return  # it is asked again after a while
+        self._deaf_since = None
+        lines = reply.ok.payload.to_bytes().splitlines()
+        self._fetched.discard(int(lines[0]))
+        for line in lines[1:]:
+            record = from_json(line)
+            expected = self._next.get(record.loop)
+            if expected is not None and record.pass_no >= expected:
+                self._next[record.loop] = record.pass_no + 1
+                self._waiting.append(record)
+        if len(lines) > SINCE_LIMIT and int(lines[0]) in self._next:
+            self._fetch(int(lines[0]))
+
+    # Questions.
+
+    def ask(
+        self, what: str, payload: bytes | None = None, attachment: bytes | None = None, deadline: float | None = None
+    ) -> bytes:
+        """Ask Knowledge, again until it answers.
+
+        Raises
+        ------
+        Refused
+            It says no, and why.
+        BusError
+            It does not answer within the patience.
+        """
+        if self._session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        if deadline is None and self.patience is not None:
+            deadline = time.monotonic() + self.patience
+        pause, tick = 0.005, threading.Event()
+        while True:
+            # Nobody there, a hub that fell over the question, and one that is just restarting look the same: no reply.
+            # To ask again is safe, as Knowledge takes everything once.
+            outcome = "no reply"
+            for reply in self._session.get(
+                self.wire.ask(what), payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
+            ):
+                if reply.ok is not None:
+                    self._deaf_since = None
+                    return bytes(reply.ok.payload.to_bytes())
+                outcome = "Timeout" if reply.err is None else reply.err.payload.to_string()
+                if outcome != "Timeout" and not outcome.startswith("later: "):
+                    raise Refused(f"{self.role} is refused by Knowledge: {outcome}")
+            if outcome == "Timeout":
+                self._lost()
+            if deadline is not None and time.monotonic() > deadline:
+                raise BusError(
+                    f"Knowledge on {self.wire.endpoint} did not answer {self.role} ({outcome}). Is it running, with "
+                    "the same system?"
+                )
+            if pause > 0.1:
+                self._say(f"waiting for Knowledge on {self.wire.endpoint}")
+            # No event tells that a queryable is there again; where one reply was lost, the first pause is short.
+            tick.wait(pause)
+            pause = min(2 * pause, 0.2)
+
+    def snapshot(self, loop: int) -> tuple[State, QTable | None] | None:
+        """Return this role's newest state of a loop, or None where it has none."""
+        found = self.ask(f"snapshot/{self.role}?loop={loop}")
+        return State.unpack(found) if found else None
+
+    def keep(self, state: State, table: QTable | None = None) -> None:
+        """Have a state kept; that it got lost does no harm, as another one will follow."""
+        self._mention(f"snapshot/{self.role}", state.pack(table), self._epoch)
+
+    def _mention(self, what: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Ask Knowledge once, and do not wait for the answer."""
+        if self._session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        self._session.get(
+            self.wire.ask(what), _UNHEARD, payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
+        )
+
+    def keep_surely(self, state: State, table: QTable | None = None) -> None:
+        """Have a state kept, and wait for the answer."""
+        self.ask(f"snapshot/{self.role}", state.pack(table), self._epoch)
+
+    def swapped(self, swap: Swapped) -> None:
+        """Have it kept that a part was replaced; from its pass on every restart uses the new one."""
+        self.ask(f"swapped/{self.role}", swap.pack(), self._epoch)
+
+    def note(
+        self, kind: str, text: str, loop: int | None = None, number: int | None = None, *, surely: bool = True
+    ) -> None:
+        """Note an event beside the records; `surely` waits for the answer."""
+        what, payload = f"event/{self.role}", Happened(kind=kind, text=text, loop=loop, pass_no=number).pack()
+        if surely:
+            self.ask(what, payload)
+        else:
+            self._mention(what, payload)
+
+    def history(self, loop: int, stages: Mapping[int, int]) -> list[Record]:
+        """Return the records of the stages named, each from its pass on; as many as fit into one answer."""
+        wanted = ",".join(f"{stage}:{number}" for stage, number in stages.items())
+        return [from_json(line) for line in self.ask(f"since?loop={loop};from={wanted}").splitlines()[1:]]
+
+    def table(self, which: str) -> QTable:
+        """Return a Q-table, by ``sha256=...`` or by ``loop=...;pass=...``."""
+        _, table = Table.unpack(self.ask(f"table?{which}"))
+        if table is None:
+            raise BusError("Knowledge answered without the Q-table that it was asked for")
+        return table
+
+    def remember(self, table: QTable) -> str:
+        """Have a Q-table kept for a later plan; return its hash."""
+        return self.ask("remember/plan", Table(loop=None, pass_no=None).pack(table)).decode()
+
+    def answer(self, asked: Asked, payload: bytes) -> None:
+        """Answer a question to this role."""
+        with suppress(zenoh.ZError), asked.query as query:  # who asked may have gone
+            query.reply(self.wire.control(self.role), payload)
+
+    def refuse(self, query: zenoh.Query, why: str) -> None:
+        """Say no to a question to this role, and why."""
+        with suppress(zenoh.ZError), query:
+            query.reply_err(why)
+
+    def beat(self, *, waiting: bool = False) -> None:
+        """Say that the thread that does the work is alive; from within `receive` it is said by itself."""
+        if self._session is None:
+            return
+        self._beat_at = time.monotonic() + BEAT_EVERY
+        epoch = self.joined.epoch
+        self._beats.put(
+            Beat(epoch=epoch, pid=os.getpid(), passes=self.passes, refused=self.refused, waiting=waiting).pack()
+        )

@@ -1,0 +1,68 @@
+"""`mapek serve`: one process of a run, on whatever machine."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+from adapters.buses.wire import Wire, system_segment
+from adapters.cli.common import config_of, open_folder, prepare, say
+from adapters.processes.serve import (
+    LOG_NAME,
+    Terminated,
+    leash,
+    serve_knowledge,
+    serve_role,
+    terminated_by_signal,
+)
+from mape.config import Config
+from mape.errors import ConfigError
+
+
+def execute(chosen: argparse.Namespace) -> int:
+    """Run the command."""
+    prepare()
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    if chosen.leash:
+        leash()
+    try:
+        with terminated_by_signal():
+            return _serve(chosen)
+    except Terminated:
+        return 143
+
+
+def _serve(chosen: argparse.Namespace) -> int:
+    config = config_of(chosen.config, chosen, chosen.agent)
+    knowledge = chosen.role == "knowledge"
+    endpoint, wrong = (chosen.listen, chosen.connect) if knowledge else (chosen.connect, chosen.listen)
+    if endpoint is None or wrong is not None:
+        raise ConfigError(
+            f"role {chosen.role} {'listens' if knowledge else 'connects'}: give "
+            f"{'--listen' if knowledge else '--connect'} ENDPOINT, such as tcp/127.0.0.1:7447, and not the other"
+        )
+    tls = None if chosen.tls is None else Path(chosen.tls)
+    wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure)
+    if not knowledge:
+        serve_role(config, chosen.role, wire)
+        return 0
+    kept = {"durability": chosen.durability, "snapshot_every": chosen.snapshot_every}
+    if chosen.log is not None:  # somebody else makes the tables
+        path = None if chosen.log == ":memory:" else Path(chosen.log)  # in memory: to be measured against
+        serve_knowledge(config, wire, path, **kept)
+        return 0
+    _serve_with_results(chosen, config, wire, kept)
+    return 0
+
+
+def _serve_with_results(chosen: argparse.Namespace, config: Config, wire: Wire, kept: dict[str, object]) -> None:
+    """Be Knowledge, with a folder of results at the end as `mapek up` makes it."""
+    from adapters.cli import up
+
+    label = chosen.agent or config.name
+    with open_folder(chosen, "up", config.name, {label: config}, check=lambda config: None) as folder:
+        say(chosen, f"Knowledge listens on {wire.endpoint}; its log is {folder.path / LOG_NAME}")
+        serve_knowledge(config, wire, folder.path / LOG_NAME, **kept)  # type: ignore[arg-type]
+        up.conclude(chosen, config, label, folder)

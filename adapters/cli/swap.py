@@ -1,0 +1,53 @@
+"""`mapek swap`: another part for a loop that runs."""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from typing import Any
+
+from adapters.buses.messages import Control, Swap
+from adapters.cli.common import operator
+from mape.errors import BusError, ConfigError, MapekError
+from mape.parts import owner
+
+ANSWERED_WITHIN = 60.0
+"""Seconds that a role has to check the part and to reach the end of its pass."""
+
+
+def execute(chosen: argparse.Namespace) -> int:
+    """Run the command."""
+    role = owner(chosen.part)
+    control = Control(what="swap", part=chosen.part, to=_spec(chosen.to)).pack()
+    with operator(chosen) as (session, wire):
+        said = None
+        for reply in session.get(wire.control(role), payload=control, timeout=ANSWERED_WITHIN):
+            if reply.ok is not None:
+                _print(Swap.unpack(reply.ok.payload.to_bytes())[0], chosen.to)
+                return 0
+            said = None if reply.err is None else reply.err.payload.to_string()
+    if said is None or said == "Timeout":
+        raise BusError(
+            f"{role} did not answer on {wire.endpoint}. Is it there (`mapek status --connect {wire.endpoint}`), and "
+            "does the loop run?"
+        )
+    raise MapekError(said)
+
+
+def _spec(text: str) -> dict[str, Any]:
+    if not text.lstrip().startswith("{"):
+        return {"name": text}
+    try:
+        table = tomllib.loads(f"to = {text}")["to"]
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f'{text!r} is no inline table such as {{name = "morphin", alpha = 0.2}}: {error}') from None
+    if not isinstance(table.get("name"), str):
+        raise ConfigError(f'{text!r} names no part; give {{name = "..."}} and its options')
+    return dict(table)
+
+
+def _print(swap: Swap, to: str) -> None:
+    first, last = min(swap.passes), max(swap.passes)
+    when = f"pass {first}" if first == last else f"passes {first} to {last} of {len(swap.passes)} loops"
+    kept = "with the state of the one before" if swap.handed_over else "from a fresh start"
+    print(f"from {when} on, {swap.part} is {to}, {kept}")

@@ -1,0 +1,173 @@
+"""`mapek up`: a config as five processes on this machine, watched, and started again when they die."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import tempfile
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from adapters.buses.wire import ROLES, Wire, system_segment
+from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.cli.run import as_json, report
+from adapters.cli.sentences import sentence
+from adapters.experiments.runner import check
+from adapters.processes.export import export
+from adapters.processes.serve import LOG_NAME, Terminated, open_ledger, terminated_by_signal
+from adapters.processes.supervise import KNOWLEDGE, Supervisor, command_of
+from adapters.results import RunFolder
+from knowledge import from_json
+from mape.config import Config
+
+
+def execute(chosen: argparse.Namespace) -> int:
+    """Run the command."""
+    try:
+        with terminated_by_signal():
+            return _run(chosen)
+    except Terminated:  # before there was a folder to speak of
+        return 143
+
+
+def _run(chosen: argparse.Namespace) -> int:
+    prepare()
+    config = config_of(chosen.config, chosen, chosen.agent)
+    label = chosen.agent or config.name
+    with contextlib.ExitStack() as opened:
+        endpoint = chosen.listen or _own_endpoint(opened)
+        tls = None if chosen.tls is None else Path(chosen.tls)
+        wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure)
+        folder = opened.enter_context(open_folder(chosen, "up", config.name, {label: config}, check=_check))
+        try:
+            _drive(chosen, config, label, wire, folder)
+            conclude(chosen, config, label, folder)
+        except (KeyboardInterrupt, Terminated) as stop:
+            code = 130 if isinstance(stop, KeyboardInterrupt) else 143
+            say(chosen, f"stopped. All that was logged is kept; `mapek resume {folder.path}` continues.")
+            return code
+    return 0
+
+
+def conclude(chosen: argparse.Namespace, config: Config, label: str, folder: RunFolder) -> None:
+    """Make of Knowledge's log what `mapek run` makes: tables, summary, figures."""
+    results = _collect(config, label, folder)
+    result = as_json(config, results)
+    report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
+    figures = []
+    if not chosen.no_figures:
+        from adapters.experiments.pictures import pictures_of_run
+
+        figures = pictures_of_run(folder, label)
+    finish(chosen, folder, result, figures)
+
+
+def _own_endpoint(opened: contextlib.ExitStack) -> str:
+    # A socket in a folder that only this user can enter; its path has to be short.
+    folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mapek-"))
+    return f"unixsock-stream/{folder}/k.sock"
+
+
+def _check(config: Config) -> object:
+    # What a free-running system is made of can be looked at as if it waited.
+    still = config.execute.model_copy(update={"mode": "lockstep", "rate": None})
+    return check(config.model_copy(update={"execute": still}))
+
+
+def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, folder: RunFolder) -> None:
+    logs = folder.path / "logs"
+    logs.mkdir(exist_ok=True)
+    ledger = open_ledger(config, folder.path / LOG_NAME, chosen.durability)
+    with ledger.store:
+        if ledger.complete:
+            return  # only its tables are still to be made
+    path = folder.path / f"config-{label}.json"
+    shared = [*(["--tls", str(wire.tls)] if wire.tls else []), *(["--insecure"] if wire.insecure else [])]
+    kept = ["--durability", chosen.durability, "--snapshot-every", str(chosen.snapshot_every)]
+    commands = {
+        KNOWLEDGE: command_of(
+            KNOWLEDGE, path, "--listen", wire.endpoint, "--log", str(folder.path / LOG_NAME), *kept, *shared
+        ),
+        **{role: command_of(role, path, "--connect", wire.endpoint, *shared) for role in ROLES},
+    }
+    screen = Screen(chosen, config)
+    with Supervisor(wire, commands, logs, hang_after=chosen.hang_after) as supervisor, screen:
+        supervisor.watch(screen.show)
+        restarts = {role: child.restarts for role, child in supervisor.children.items() if child.restarts}
+    if restarts:
+        say(chosen, "restarts: " + ", ".join(f"{role} {count}" for role, count in restarts.items()))
+
+
+def _collect(config: Config, label: str, folder: RunFolder) -> list[Any]:
+    ledger = open_ledger(config, folder.path / LOG_NAME, "normal")
+    with ledger.store:
+        results = export(config, ledger, Path(folder.chunk_stem(label, 0, config.units)))
+    folder.assemble(label)
+    return results
+
+
+class Screen:
+    """What one sees of a run: a table that is drawn anew on a terminal, elsewhere a line now and then."""
+
+    def __init__(self, chosen: argparse.Namespace, config: Config) -> None:
+        self._quiet = chosen.quiet
+        self._total = config.units * config.episodes
+        self._began = time.monotonic()
+        self._seen: deque[tuple[float, int]] = deque(maxlen=20)
+        self._live: Any = None
+        self._said_at = time.monotonic()
+
+    def __enter__(self) -> Screen:
+        if not self._quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.live import Live
+
+            self._live = Live(console=Console(stderr=True), transient=True, auto_refresh=False)
+            self._live.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self._live is not None:
+            self._live.__exit__(*error)
+
+    def show(self, supervisor: Supervisor) -> None:
+        """Show how far the run is."""
+        status = supervisor.status
+        passes = 0 if status is None else status.passes
+        now = time.monotonic()
+        if not self._seen or now - self._seen[-1][0] > 0.4:
+            self._seen.append((now, passes))
+        (then, before), (here, after) = self._seen[0], self._seen[-1]
+        rate = (after - before) / (here - then) if here > then else 0.0
+        left = f"{(self._total - passes) / rate:,.0f} s left" if rate > 0 else "waiting"
+        if self._live is not None:
+            self._live.update(self._table(supervisor, f"{passes:,} of {self._total:,} passes, {rate:,.0f}/s, {left}"))
+            self._live.refresh()
+        elif not self._quiet and now - self._said_at > 10.0:
+            self._said_at = now
+            print(f"{passes:,} of {self._total:,} passes, {rate:,.0f}/s, {left}", file=sys.stderr, flush=True)
+
+    def _table(self, supervisor: Supervisor, title: str) -> Any:
+        from rich.table import Table
+
+        table = Table(title=title, title_justify="left", expand=True)
+        for name in ("role", "pid", "pass", "restarts", "state"):
+            table.add_column(name, no_wrap=True)
+        table.add_column("last record", no_wrap=True, ratio=1, overflow="ellipsis")
+        status = supervisor.status
+        for name, child in supervisor.children.items():
+            role = None if status is None else status.roles.get(name)
+            last, said, state = "", "", "starting"
+            if role is not None and status is not None:
+                last = f"{max(0, role.last_pass):,}"
+                state = "done" if child.done else "here" if role.alive else "away"
+                body = status.last[ROLES.index(name)]
+                said = sentence(from_json(body)).split(maxsplit=1)[1] if body else ""
+            elif name == KNOWLEDGE and status is not None:
+                state, last = "here", f"{status.passes // max(1, status.units):,}"
+                said = f"{status.refused} refused, {status.dropped} dropped"
+            table.add_row(name, str(child.pid), last, str(child.restarts), state, said)
+        return table

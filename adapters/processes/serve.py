@@ -1,0 +1,139 @@
+"""One process of a run: Knowledge, or one of the roles that join it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+from adapters.buses.hub import KnowledgeHub, versions
+from adapters.buses.member import Member
+from adapters.buses.messages import Layout
+from adapters.buses.wire import Wire
+from adapters.stores import Store
+from adapters.stores.ledger import Ledger
+from mape.config import Config
+from mape.errors import ResultsError
+
+logger = logging.getLogger(__name__)
+
+LOG_NAME = "log.sqlite"
+"""Name of Knowledge's file in the folder of a run."""
+
+LEFT_WITHIN = 5.0
+"""Seconds that the roles of a complete run have to leave before Knowledge does."""
+
+
+class Terminated(BaseException):
+    """SIGTERM came."""
+
+
+@contextlib.contextmanager
+def terminated_by_signal() -> Iterator[None]:
+    """Let SIGTERM end what runs here as Ctrl-C does: by an exception, so that sessions are closed."""
+
+    def raise_it(number: int, frame: FrameType | None) -> None:
+        # Once: what cleans up then is not to be broken off by the next signal.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, raise_it)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def leash() -> None:
+    """End this process when the one that started it is gone: its standard input then ends."""
+
+    def watch() -> None:
+        # The descriptor itself: a thread that waits in `sys.stdin` would abort the interpreter's exit.
+        with contextlib.suppress(OSError):
+            while os.read(0, 4096):
+                pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, name="leash", daemon=True).start()
+
+
+def quick_switches() -> None:
+    """Let Zenoh's threads have the interpreter when something arrives; by default they wait five milliseconds."""
+    sys.setswitchinterval(0.0005)
+
+
+def open_ledger(config: Config, path: Path | None, durability: str) -> Ledger:
+    """Open or begin Knowledge's file of a run.
+
+    Raises
+    ------
+    ResultsError
+        It is that of another run, or another process writes it.
+    """
+    store = Store(path, durability)
+    facts = store.facts()
+    wanted = json.loads(config.to_json())
+    if facts.get("config", wanted) != wanted:
+        store.close()
+        raise ResultsError(f"{path} is the log of a run with another config; choose another folder")
+    if "config" not in facts:
+        store.set_facts(config=wanted, versions=versions())
+        store.commit()
+    return Ledger(store, config.units, config.episodes, free=config.execute.mode == "free")
+
+
+def serve_knowledge(
+    config: Config, wire: Wire, path: Path | None, *, durability: str = "normal", snapshot_every: int = 100
+) -> None:
+    """Be Knowledge until the run is complete and the roles have left.
+
+    Raises
+    ------
+    ResultsError
+        The log cannot be written; what was acknowledged is kept.
+    """
+    quick_switches()
+    ledger = open_ledger(config, path, durability)
+    try:
+        hub = KnowledgeHub(ledger, wire, json.loads(config.to_json()), versions(), snapshot_every)
+        with hub:
+            logger.info("Knowledge listens on %s", wire.endpoint)
+            while not hub.ended.wait(0.2):
+                pass  # in steps, so that signals are heard
+            if hub.failure is not None:
+                raise hub.failure
+            hub.left.wait(LEFT_WITHIN)
+    finally:
+        ledger.store.close()
+
+
+def serve_role(config: Config, role: str, wire: Wire) -> None:
+    """Be one of the roles until the run is complete.
+
+    Raises
+    ------
+    MapekError
+        A part or the system failed, or Knowledge refuses this role.
+    """
+    from adapters.processes.role import make_role
+
+    quick_switches()
+
+    def member_of(layout: Layout | None) -> Member:
+        return Member(
+            wire,
+            role,
+            config=json.loads(config.to_json()),
+            versions=versions(),
+            layout=layout,
+            waiting=lambda sentence: print(f"{role}: {sentence}", file=sys.stderr, flush=True),  # noqa: T201
+        )
+
+    make_role(role, config, member_of).run()

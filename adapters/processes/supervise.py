@@ -1,0 +1,266 @@
+"""Starts the five processes of a run on this machine, watches them, and starts them again when they die.
+
+Who died by a signal is started again at once. Who ended with an error gets one more try, for the error may have been
+the world's; where it comes again at the same place, the run ends with it. Who is alive and says nothing for too long is
+hung: it is killed, and started again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import zenoh
+
+from adapters.buses.messages import Status
+from adapters.buses.wire import ROLES, Wire
+from knowledge import MalformedRecord
+from mape.errors import BusError, ConfigError, MapekError
+
+KNOWLEDGE = "knowledge"
+
+LOOK_EVERY = 0.1
+"""Seconds between two looks at the processes."""
+
+STATUS_EVERY = 0.5
+"""Seconds between two questions to Knowledge."""
+
+ENDS_WITHIN = 1.5
+"""Seconds that a process has to end after SIGTERM, before SIGKILL."""
+
+STARTS_WITHIN = 30.0
+"""Seconds that Knowledge has for its start, before its silence counts."""
+
+CRASHES, CRASHES_WITHIN = 10, 10.0
+"""So many deaths of one role in so many seconds without a pass in between, and the run is given up."""
+
+
+class Failed(MapekError):
+    """A process of the run failed in a way that another start does not mend."""
+
+
+class Child:
+    """One process of the run, over all its starts."""
+
+    def __init__(self, role: str, command: Sequence[str], log: Path) -> None:
+        self.role = role
+        self.command = list(command)
+        self.log = log
+        self.starts = 0
+        self.process: subprocess.Popen[bytes] | None = None
+        self.started_at = 0.0
+        self.deaths: deque[tuple[float, int]] = deque(maxlen=CRASHES)
+        self.errors = 0
+        self.done = False
+
+    @property
+    def pid(self) -> int:
+        """Process id, 0 before the first start."""
+        return 0 if self.process is None else self.process.pid
+
+    @property
+    def restarts(self) -> int:
+        """How often it was started again."""
+        return max(0, self.starts - 1)
+
+    def start(self) -> None:
+        """Start it, in a session of its own, so that Ctrl-C reaches the supervisor alone."""
+        with open(self.log, "ab") as log:
+            self.process = subprocess.Popen(
+                self.command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+            )
+        self.starts += 1
+        self.started_at = time.monotonic()
+
+    def end(self) -> None:
+        """Ask it to end."""
+        if self.process is not None and self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                self.process.send_signal(signal.SIGCONT)  # a frozen one cannot hear
+                self.process.terminate()
+
+    def kill(self) -> None:
+        """End it at once."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.kill()
+
+    def wait(self, timeout: float) -> None:
+        """Wait until it has ended; kill it if it does not."""
+        if self.process is None:
+            return
+        try:
+            self.process.wait(max(0.0, timeout))
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdin is not None:
+            self.process.stdin.close()
+
+    def said(self) -> str:
+        """Return the last lines that it wrote."""
+        with contextlib.suppress(OSError):
+            return "\n".join(self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-6:])
+        return ""
+
+
+class Supervisor:
+    """The processes of one run.
+
+    Parameters
+    ----------
+    wire
+        Where they meet.
+    commands
+        Role -> command line; Knowledge's among them.
+    logs
+        Folder for what they write.
+    hang_after
+        Seconds after which a process that is alive and silent is taken for hung.
+    """
+
+    def __init__(self, wire: Wire, commands: dict[str, list[str]], logs: Path, *, hang_after: float = 60.0) -> None:
+        self.wire = wire
+        self.hang_after = hang_after
+        self.children = {role: Child(role, command, logs / f"{role}.log") for role, command in commands.items()}
+        self.status: Status | None = None
+        self._heard_at = 0.0
+        self._asked_at = 0.0
+        self._passes = 0
+        self._operator: zenoh.Session | None = None
+
+    def __enter__(self) -> Self:
+        for role in (KNOWLEDGE, *ROLES):
+            self.children[role].start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._operator is not None:
+            self._operator.close()  # type: ignore[no-untyped-call]
+        for child in self.children.values():
+            child.end()
+        deadline = time.monotonic() + ENDS_WITHIN
+        for child in self.children.values():
+            child.wait(deadline - time.monotonic())
+
+    def watch(self, tell: Callable[[Supervisor], object] = lambda supervisor: None) -> None:
+        """Look after the processes until the run is complete and all have ended.
+
+        Parameters
+        ----------
+        tell
+            Called after each look.
+
+        Raises
+        ------
+        Failed
+            A process ended with an error twice, or dies again and again.
+        ConfigError
+            One of them could not make what the config names.
+        """
+        # Knowledge leaves last, and leaves only a complete run; who is killed on the way out has lost nothing.
+        while not self.children[KNOWLEDGE].done:
+            for child in self.children.values():
+                self._look_at(child)
+            self._ask()
+            tell(self)
+            time.sleep(LOOK_EVERY)
+
+    def _look_at(self, child: Child) -> None:
+        assert child.process is not None
+        if child.done:
+            return
+        code = child.process.poll()
+        if code is None:
+            self._is_hung(child)
+            return
+        if code == 0:
+            child.done = True
+            return
+        if code == 2:
+            raise ConfigError(_last_sentence(child))
+        now = time.monotonic()
+        child.deaths.append((now, self._passes))
+        if code > 0:
+            child.errors += 1
+            if child.errors > 1 and child.deaths[-2][1] == self._passes:
+                raise Failed(
+                    f"{child.role} failed twice at the same place: {_last_sentence(child)} What was acknowledged is "
+                    "kept."
+                )
+        oldest, passes = child.deaths[0]
+        if len(child.deaths) == CRASHES and now - oldest < CRASHES_WITHIN and passes == self._passes:
+            raise Failed(
+                f"{child.role} died {CRASHES} times within {now - oldest:.0f} s, without a pass in between (exit code "
+                f"{code}): {_last_sentence(child)} What was acknowledged is kept."
+            )
+        child.start()
+
+    def _is_hung(self, child: Child) -> None:
+        if time.monotonic() - child.started_at < self.hang_after:
+            return
+        if child.role == KNOWLEDGE:
+            if self._heard_at < child.started_at:  # it has not said its first word yet
+                silent = time.monotonic() - child.started_at - STARTS_WITHIN
+            else:
+                silent = time.monotonic() - self._heard_at
+        else:
+            role = None if self.status is None else self.status.roles.get(child.role)
+            if role is None or role.pid != child.pid or role.beat_age is None:
+                return
+            silent = role.beat_age
+        if silent > self.hang_after:
+            child.kill()
+
+    def _ask(self) -> None:
+        now = time.monotonic()
+        if now - self._asked_at < STATUS_EVERY:
+            return
+        self._asked_at = now
+        try:
+            if self._operator is None:
+                self._operator = self.wire.join("operator", 0.2)
+            found = ask_status(self._operator, self.wire, 0.5)
+        except BusError:
+            return
+        if found:
+            self.status = found[0]
+            self._heard_at = time.monotonic()
+            if self.status.passes > self._passes:
+                self._passes = self.status.passes
+                for child in self.children.values():
+                    child.errors = 0
+
+
+def ask_status(session: zenoh.Session, wire: Wire, timeout: float) -> list[Status]:
+    """Return what each Knowledge that can be reached says of its run."""
+    found = []
+    for reply in session.get(wire.ask("status"), timeout=timeout):
+        if reply.ok is not None:
+            with contextlib.suppress(MalformedRecord):
+                found.append(Status.unpack(reply.ok.payload.to_bytes())[0])
+    return found
+
+
+def _last_sentence(child: Child) -> str:
+    lines = [line for line in child.said().splitlines() if line.strip()]
+    told = [line.removeprefix("mapek: ") for line in lines if line.startswith("mapek: ")]
+    text = told[-1] if told else (lines[-1] if lines else "it said nothing")
+    return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def command_of(role: str, config: Path, *options: str) -> list[str]:
+    """Return the command line of a process."""
+    return [sys.executable, "-m", "mape", "serve", str(config), "--role", role, "--leash", *options]
+
+
+def environment() -> dict[str, Any]:
+    """Return what the processes share of this one's environment."""
+    return dict(os.environ)

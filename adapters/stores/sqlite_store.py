@@ -1,0 +1,394 @@
+"""Durable Knowledge: one SQLite file (WAL) per run, which any SQLite tool can open.
+
+Schema, version 1 (``PRAGMA user_version``); times are seconds since 1970, in UTC:
+
+=============  ==========================================================================================
+table          holds
+=============  ==========================================================================================
+``run``        facts of the run by name, as JSON: config, versions, layout, seal, begun
+``records``    the log: one row per record. ``stage`` is 0 Observation, 1 Symptom, 2 ChangeRequest,
+               3 ChangePlan; ``body`` the record as JSON, byte for byte as it was sent; ``row``, with a
+               ChangePlan of a lockstep run, the packed pass of which the log's hash is taken
+``dropped``    of free-running loops: the episodes that were driven and could not be logged
+``snapshots``  the newest states of each role, from which it goes on after a crash: JSON, and the hash of
+               a Q-table; ``final`` marks the one at the end of the run
+``q_tables``   Q-tables by SHA-256: ids of the rows, number of states, row-major little-endian float64
+``versions``   which Q-table was the one at the end of an episode, where a planner asked for it
+``swaps``      parts that were replaced, the first pass that the new one served, whether it took over the old
+               one's state, and whether the config had planned it
+``roles``      how often each role has joined: its newest epoch
+``events``     what happened beside the records: who joined, what was refused or aborted
+=============  ==========================================================================================
+
+What `commit` has returned from survives the end of the process, however sudden; with ``durability="full"`` the end of
+the machine's power too, at the price of a disk flush per commit. Not for network file systems, which do not lock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import sqlite3
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+from knowledge import QTable
+from mape.errors import ResultsError
+
+VERSION = 1
+APPLICATION = 0x4D50454B  # "MPEK"
+
+SCHEMA = """
+CREATE TABLE run (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE records (
+    loop INTEGER, pass INTEGER, stage INTEGER, body TEXT NOT NULL, row BLOB, PRIMARY KEY (loop, pass, stage)
+) WITHOUT ROWID;
+CREATE TABLE dropped (loop INTEGER, first INTEGER, last INTEGER NOT NULL, PRIMARY KEY (loop, first)) WITHOUT ROWID;
+CREATE TABLE snapshots (
+    loop INTEGER, role TEXT, pass INTEGER, final INTEGER NOT NULL, state TEXT NOT NULL, q_table TEXT,
+    PRIMARY KEY (loop, role, pass)
+) WITHOUT ROWID;
+CREATE TABLE q_tables (
+    sha256 TEXT PRIMARY KEY, actions TEXT NOT NULL, states INTEGER NOT NULL, body BLOB NOT NULL,
+    remembered INTEGER NOT NULL
+);
+CREATE TABLE versions (loop INTEGER, pass INTEGER, q_table TEXT NOT NULL, PRIMARY KEY (loop, pass)) WITHOUT ROWID;
+CREATE TABLE swaps (
+    loop INTEGER, pass INTEGER, part TEXT, spec TEXT NOT NULL, handed_over INTEGER NOT NULL, planned INTEGER NOT NULL,
+    PRIMARY KEY (loop, pass, part)
+) WITHOUT ROWID;
+CREATE TABLE roles (role TEXT PRIMARY KEY, epoch INTEGER NOT NULL);
+CREATE TABLE events (
+    number INTEGER PRIMARY KEY, time REAL NOT NULL, role TEXT NOT NULL, kind TEXT NOT NULL, loop INTEGER, pass INTEGER,
+    text TEXT NOT NULL
+);
+"""
+
+SNAPSHOTS_KEPT = 2
+
+
+class Snapshot(NamedTuple):
+    """State of a role after the record of pass `pass_no` that it sent."""
+
+    loop: int
+    role: str
+    pass_no: int
+    state: Any
+    table: QTable | None
+    final: bool = False
+
+
+class Swap(NamedTuple):
+    """A part that was replaced; `spec` is its name and options, `planned` whether the config has it."""
+
+    loop: int
+    pass_no: int
+    part: str
+    spec: dict[str, Any]
+    handed_over: bool
+    planned: bool
+
+
+class Event(NamedTuple):
+    """Something that happened beside the records."""
+
+    number: int
+    time: float
+    role: str
+    kind: str
+    loop: int | None
+    pass_no: int | None
+    text: str
+
+
+class Store:
+    """One run's file. All writes but those of `begin`, `join` and `event` wait for `commit`.
+
+    Parameters
+    ----------
+    path
+        The file, or None to keep all in memory.
+    durability
+        ``"normal"`` or ``"full"``; see the module.
+    readonly
+        Open an existing file for reading, beside a process that writes it.
+
+    Raises
+    ------
+    ResultsError
+        The file is no store of this version, another process writes it, or it cannot be opened.
+    """
+
+    def __init__(self, path: Path | None, durability: str = "normal", *, readonly: bool = False) -> None:
+        self.path = path
+        self._lock: IO[bytes] | None = None
+        self._writing = False
+        try:
+            if readonly:
+                if path is None or not path.is_file():
+                    raise ResultsError(f"there is no log {path}; `mapek up` and `mapek serve` write one")
+                self._db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
+            else:
+                self._lock = None if path is None else _locked(path)
+                # Written by the one thread that answers all queries, opened by another.
+                self._db = sqlite3.connect(path or ":memory:", isolation_level=None, check_same_thread=False)
+            self._open(durability, readonly)
+        except sqlite3.Error as error:
+            self.close()
+            raise ResultsError(f"{path} cannot be opened as a log: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, durability: str, readonly: bool) -> None:
+        application = self._number("PRAGMA application_id")
+        version = self._number("PRAGMA user_version")
+        empty = self._number("SELECT count(*) FROM sqlite_master") == 0
+        if (empty and readonly) or (not empty and application != APPLICATION):
+            raise ResultsError(f"{self.path} is no log of a run; name the folder or file that `mapek up` wrote")
+        if not empty and version != VERSION:
+            raise ResultsError(f"{self.path} has schema version {version}; this mapek reads version {VERSION}")
+        if readonly:
+            return
+        if self.path is not None:
+            self._db.execute("PRAGMA journal_mode = WAL")
+            self._db.execute(f"PRAGMA synchronous = {durability.upper()}")
+            # Each checkpoint waits for the disk, and all that wait for an acknowledgement wait with it.
+            self._db.execute("PRAGMA wal_autocheckpoint = 4000")
+        if empty:
+            script = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {VERSION};"
+            self._db.executescript(f"BEGIN; {SCHEMA} {script} COMMIT;")
+
+    def close(self) -> None:
+        """Leave the file; what was not committed is gone."""
+        if hasattr(self, "_db"):
+            if self._lock is not None:
+                # Leaves one file, without its companions; not if somebody reads it just now, or the disk is full.
+                with contextlib.suppress(sqlite3.Error):
+                    self.roll_back()
+                    self._db.execute("PRAGMA journal_mode = DELETE")
+            self._db.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # Transactions: many appends, one commit.
+
+    def commit(self) -> None:
+        """Make everything since the last commit last.
+
+        Raises
+        ------
+        ResultsError
+            The disk is full, or the file cannot be written; nothing of it was.
+        """
+        if self._writing:
+            self._run("COMMIT")
+            self._writing = False
+
+    def roll_back(self) -> None:
+        """Forget everything since the last commit."""
+        if self._writing:
+            self._writing = False
+            if self._db.in_transaction:  # SQLite rolls back by itself where the disk is full
+                self._db.execute("ROLLBACK")
+
+    def _write(self, statement: str, *values: Any) -> sqlite3.Cursor:
+        if not self._writing:
+            self._run("BEGIN IMMEDIATE")
+            self._writing = True
+        return self._run(statement, *values)
+
+    def _run(self, statement: str, *values: Any) -> sqlite3.Cursor:
+        try:
+            return self._db.execute(statement, values)
+        except sqlite3.Error as error:
+            raise ResultsError(
+                f"{self.path} cannot be written: {error}. What was acknowledged before is kept; make room, and go on "
+                "with `mapek resume`."
+            ) from error
+
+    def _number(self, statement: str, *values: Any) -> int:
+        found = self._db.execute(statement, values).fetchone()
+        return -1 if found is None or found[0] is None else int(found[0])
+
+    # Facts of the run.
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts of the run; empty where it has not begun."""
+        return {name: json.loads(value) for name, value in self._db.execute("SELECT name, value FROM run")}
+
+    def set_facts(self, **facts: Any) -> None:
+        """Write facts of the run."""
+        for name, value in facts.items():
+            self._write("INSERT OR REPLACE INTO run VALUES (?, ?)", name, json.dumps(value))
+
+    def join(self, role: str) -> int:
+        """Count that `role` joins; return its epoch, from 1."""
+        self._write(
+            "INSERT INTO roles VALUES (?, 1) ON CONFLICT (role) DO UPDATE SET epoch = epoch + 1",
+            role,
+        )
+        return self.epoch(role)
+
+    def epoch(self, role: str) -> int:
+        """Return how often `role` has joined."""
+        return max(0, self._number("SELECT epoch FROM roles WHERE role = ?", role))
+
+    # The log.
+
+    def append(self, loop: int, number: int, stage: int, body: str, row: bytes | None = None) -> None:
+        """Write a record that is next in its log."""
+        self._write("INSERT INTO records VALUES (?, ?, ?, ?, ?)", loop, number, stage, body, row)
+
+    def body(self, loop: int, number: int, stage: int) -> str | None:
+        """Return a record as JSON, or None where it is not in the log."""
+        query = "SELECT body FROM records WHERE loop = ? AND pass = ? AND stage = ?"
+        found = self._db.execute(query, (loop, number, stage)).fetchone()
+        return None if found is None else str(found[0])
+
+    def last(self, loop: int) -> tuple[int, int, int, int]:
+        """Return the number of the last record of each stage: -1 where there is no plan 0, else 0 for none."""
+        # From the end of the primary key backwards: the newest record of a stage is among the newest of all.
+        query = "SELECT pass FROM records WHERE loop = ? AND stage = ? ORDER BY pass DESC LIMIT 1"
+        seen, symptom, request, plan = (self._number(query, loop, stage) for stage in range(4))
+        return max(0, seen), max(0, symptom), max(0, request), plan
+
+    def since(self, loop: int, stages: Mapping[int, int], limit: int) -> list[tuple[int, int, str]]:
+        """Return (pass, stage, body) of the stages named, each from its pass on, in order of pass and stage."""
+        where = " OR ".join("(stage = ? AND pass >= ?)" for _ in stages)
+        values = [value for pair in stages.items() for value in pair]
+        query = f"SELECT pass, stage, body FROM records WHERE loop = ? AND pass >= ? AND ({where}) ORDER BY pass, stage LIMIT ?"  # noqa: E501
+        return self._db.execute(query, (loop, min(stages.values()), *values, limit)).fetchall()
+
+    def rows(self, loop: int) -> Iterator[bytes]:
+        """Yield the packed rows of plan 0 and of each finished pass, in order."""
+        query = "SELECT row FROM records WHERE loop = ? AND stage = 3 ORDER BY pass"
+        for (row,) in self._db.execute(query, (loop,)):
+            yield row
+
+    def drop(self, loop: int, first: int, last: int) -> None:
+        """Write that the episodes `first` to `last` were driven and could not be logged."""
+        self._write("INSERT INTO dropped VALUES (?, ?, ?)", loop, first, last)
+
+    def dropped(self, loop: int) -> list[tuple[int, int]]:
+        """Return what was dropped, as (first, last)."""
+        query = "SELECT first, last FROM dropped WHERE loop = ? ORDER BY first"
+        return self._db.execute(query, (loop,)).fetchall()
+
+    # States and tables.
+
+    def keep_snapshot(self, snapshot: Snapshot) -> None:
+        """Keep a role's state, and let go those that are older than the ones before it."""
+        loop, role, number, state, table, final = snapshot
+        key = None if table is None else self.keep_table(table, remembered=False)
+        self._write(
+            "INSERT OR REPLACE INTO snapshots VALUES (?, ?, ?, ?, ?, ?)",
+            loop, role, number, final, json.dumps(state), key,
+        )  # fmt: skip
+        self._write(
+            "DELETE FROM snapshots WHERE loop = ? AND role = ? AND pass NOT IN "
+            "(SELECT pass FROM snapshots WHERE loop = ? AND role = ? ORDER BY pass DESC LIMIT ?)",
+            loop, role, loop, role, SNAPSHOTS_KEPT,
+        )  # fmt: skip
+        if role == "plan":  # it will not ask again for what it read before
+            self._write("DELETE FROM versions WHERE loop = ? AND pass <= ?", loop, number)
+        if key is not None or role == "plan":
+            self._write(
+                "DELETE FROM q_tables WHERE NOT remembered AND sha256 NOT IN (SELECT q_table FROM snapshots "
+                "WHERE q_table IS NOT NULL) AND sha256 NOT IN (SELECT q_table FROM versions)"
+            )
+
+    def snapshot(self, loop: int, role: str) -> Snapshot | None:
+        """Return a role's newest state, or None."""
+        query = "SELECT pass, final, state, q_table FROM snapshots WHERE loop = ? AND role = ? ORDER BY pass DESC"
+        found = self._db.execute(query, (loop, role)).fetchone()
+        if found is None:
+            return None
+        number, final, state, key = found
+        table = None if key is None else self.table(key)
+        return Snapshot(loop, role, number, json.loads(state), table, bool(final))
+
+    def keep_table(self, table: QTable, *, remembered: bool) -> str:
+        """Keep a Q-table under its hash, which is returned; one that is remembered stays for the whole run."""
+        key = table.sha256()
+        header, body = table.to_bytes()
+        self._write(
+            "INSERT INTO q_tables VALUES (?, ?, ?, ?, ?) ON CONFLICT (sha256) DO UPDATE SET "
+            "remembered = max(remembered, excluded.remembered)",
+            key, json.dumps(header["actions"]), table.n_states, body, remembered,
+        )  # fmt: skip
+        return key
+
+    def table(self, key: str) -> QTable | None:
+        """Return the Q-table with that hash, or None."""
+        found = self._db.execute("SELECT actions, states, body FROM q_tables WHERE sha256 = ?", (key,)).fetchone()
+        if found is None:
+            return None
+        actions, states, body = json.loads(found[0]), found[1], found[2]
+        header = {"schema": "QTable/1", "actions": actions, "shape": [len(actions), states], "dtype": "<f8"}
+        return QTable.from_bytes({**header, "sha256": key}, body)
+
+    def keep_version(self, loop: int, number: int, table: QTable) -> None:
+        """Keep the Q-table at the end of episode `number`, for a planner that asked for it."""
+        key = self.keep_table(table, remembered=False)
+        self._write("INSERT OR REPLACE INTO versions VALUES (?, ?, ?)", loop, number, key)
+
+    def version(self, loop: int, number: int) -> QTable | None:
+        """Return the Q-table at the end of episode `number` if it was asked for before, or None."""
+        query = "SELECT q_table FROM versions WHERE loop = ? AND pass = ?"
+        found = self._db.execute(query, (loop, number)).fetchone()
+        return None if found is None else self.table(found[0])
+
+    # What happened beside the records.
+
+    def keep_swap(self, swap: Swap) -> None:
+        """Write that a part was replaced."""
+        loop, number, part, spec, handed_over, planned = swap
+        self._write(
+            "INSERT OR REPLACE INTO swaps VALUES (?, ?, ?, ?, ?, ?)",
+            loop, number, part, json.dumps(spec), handed_over, planned,
+        )  # fmt: skip
+
+    def swaps(self) -> list[Swap]:
+        """Return the parts that were replaced while the loop ran, in order of loop and pass."""
+        found = self._db.execute("SELECT * FROM swaps ORDER BY loop, pass, part")
+        return [
+            Swap(loop, number, part, json.loads(spec), bool(handed_over), bool(planned))
+            for loop, number, part, spec, handed_over, planned in found
+        ]
+
+    def event(self, role: str, kind: str, text: str, loop: int | None = None, number: int | None = None) -> None:
+        """Write an event, with the time of this machine's clock."""
+        self._write(
+            "INSERT INTO events (time, role, kind, loop, pass, text) VALUES (?, ?, ?, ?, ?, ?)",
+            time.time(), role, kind, loop, number, text,
+        )  # fmt: skip
+
+    def events(self, after: int = 0) -> list[Event]:
+        """Return the events numbered above `after`."""
+        query = "SELECT number, time, role, kind, loop, pass, text FROM events WHERE number > ? ORDER BY number"
+        return [Event(*row) for row in self._db.execute(query, (after,))]
+
+
+def _locked(path: Path) -> IO[bytes]:
+    """Hold the file for one writer: SQLite would let two take turns. Its own locks are of another kind."""
+    try:
+        file = open(path, "ab")  # noqa: SIM115 - held until `close`
+    except OSError as error:
+        raise ResultsError(f"{path} cannot be written: {error.strerror or error}; choose another folder") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise ResultsError(f"another Knowledge writes {path}; end it first, or choose another folder") from None
+    return file

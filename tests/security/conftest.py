@@ -1,0 +1,32 @@
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from adapters.buses import certificates
+
+# pytest imports test modules without a path to their neighbours; `security_deployment` is one.
+sys.path.append(str(Path(__file__).parent))
+
+from security_deployment import Deployment
+
+
+@pytest.fixture(scope="session")
+def shared_keys(tmp_path_factory):
+    """Keys that tests leave as they are."""
+    folder = tmp_path_factory.mktemp("keys")
+    certificates.make(folder)
+    return folder
+
+
+@pytest.fixture
+def keys(shared_keys, tmp_path):
+    """Keys that a test may spoil."""
+    return Path(shutil.copytree(shared_keys, tmp_path / "keys"))
+
+
+@pytest.fixture
+def deployment(keys):
+    with Deployment(keys) as running:
+        yield running
