@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, settings
 # modules that stand beside the tests, such as `mape_runs`, are found whatever the import mode.
 _HERE = Path(__file__).parent
 sys.path[:] = [entry for entry in sys.path if Path(entry) != _HERE]
-sys.path += [str(_HERE / folder) for folder in ("knowledge", "mape")]
+sys.path += [str(_HERE / folder) for folder in ("knowledge", "mape", "replay")]
 for _package in ("knowledge", "managed_systems", "mape"):
     importlib.import_module(_package)
 

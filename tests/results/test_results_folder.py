@@ -11,7 +11,7 @@ from real_runs import contents, leftovers
 
 from adapters.cli.main import main
 from adapters.results import COLUMNS, RunFolder, read_episodes
-from adapters.results.chunk import read_arrays, read_chunk
+from adapters.results.chunk import read_arrays, read_chunk, run_chunk
 from adapters.results.files import read_json
 from mape.config import Config, load
 from mape.errors import ResultsError
@@ -172,6 +172,37 @@ def test_an_unfinished_run_is_continued_without_doing_anything_twice(
     assert before.keys() - contents(unfinished).keys() == {name for name in before if name.startswith("chunks/")}
     found = json.loads((unfinished / "result.json").read_text())
     assert {key: found[key] for key in finished_elsewhere} == finished_elsewhere
+
+
+def test_a_run_of_several_loops_is_continued_with_those_that_are_missing(
+    config_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config_file.write_text("loops = 4\n" + CONFIG)
+    assert mapek_run("--out", "elsewhere") == 0
+
+    def stop(*task: object, **listeners: object) -> None:
+        if task[1] == 5:
+            raise ResultsError("stopped here")
+        run_chunk(*task, **listeners)
+
+    monkeypatch.setattr("adapters.experiments.runner.CHUNK_SECONDS", 1e-9)  # a chunk of each unit
+    with monkeypatch.context() as context:
+        context.setattr("adapters.experiments.runner.run_chunk", stop)
+        assert mapek_run("--out", "out") == 1
+    with RunFolder(Path("out"), "run", config_of(Path("out"))) as begun:
+        assert sorted(begun.finished("small")) == [0, 1, 2, 3, 4]
+    capsys.readouterr()
+    assert mapek_run("--out", "out") == 0
+
+    assert "continuing in out: 5 trials are finished already" in capsys.readouterr().out
+    found, wanted = (json.loads(Path(folder, "result.json").read_text()) for folder in ("out", "elsewhere"))
+    assert [found[name] for name in ("trials", "log_sha256")] == [wanted[name] for name in ("trials", "log_sha256")]
+    assert [(one["trial"], one["loop"]) for one in found["trials"]] == [divmod(unit, 4) for unit in range(12)]
+    table, other = (
+        read_episodes(f"{folder}/episodes-small.npz", (*COLUMNS, "loop")) for folder in ("out", "elsewhere")
+    )
+    for name, column in table.items():
+        np.testing.assert_array_equal(column, other[name], err_msg=name)
 
 
 @pytest.fixture
