@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sysconfig
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -86,3 +87,16 @@ def parse_override(text: str) -> Table:
         value = {part: value}
     table: Table = value
     return table
+
+
+def first_difference(one: Any, other: Any, at: str = "") -> tuple[str, Any, Any]:
+    """Return the dotted name at which two tables first differ, and what stands there in each.
+
+    >>> first_difference({"plan": {"alpha": 0.1, "k": 5}}, {"plan": {"alpha": 0.2, "k": 5}})
+    ('plan.alpha', 0.1, 0.2)
+    """
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in [*one, *other]:
+            if one.get(key) != other.get(key):
+                return first_difference(one.get(key), other.get(key), f"{at}.{key}" if at else str(key))
+    return at, one, other

@@ -47,6 +47,7 @@ from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
 from knowledge import STAGES, Ack, MalformedRecord
 from mape.errors import BusError, MapekError, ResultsError
+from mape.tables import first_difference
 
 logger = logging.getLogger(__name__)
 
@@ -555,15 +556,6 @@ def versions() -> dict[str, str]:
 def host() -> str:
     """Return this machine's name, for people."""
     return socket.gethostname()[:255]
-
-
-def first_difference(here: Any, there: Any, at: str = "") -> tuple[str, Any, Any]:
-    """Return the dotted name at which two configs first differ, and both values."""
-    if isinstance(here, Mapping) and isinstance(there, Mapping):
-        for key in [*here, *there]:
-            if here.get(key) != there.get(key):
-                return first_difference(here.get(key), there.get(key), f"{at}.{key}" if at else str(key))
-    return at or "the whole", here, there
 
 
 def _facts(layout: Layout) -> dict[str, Any]:

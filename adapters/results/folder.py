@@ -36,6 +36,7 @@ from adapters.results.table import read_episodes, read_last, write_npz
 from mape import __version__
 from mape.config import Config
 from mape.errors import ResultsError
+from mape.tables import first_difference
 from mape.trials import TrialResult
 
 FORMAT = 1
@@ -194,7 +195,7 @@ class RunFolder:
             raise ResultsError(f"{manifest} is of no run of ours; choose another --out")
         runs = {name: value for name, value in there.items() if name not in BEGUN_BY}
         if runs != wanted:
-            what, had, has = _first_difference(runs, wanted)
+            what, had, has = first_difference(runs, wanted)
             raise ResultsError(
                 f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; give the same command to "
                 "continue it, or choose another --out"
@@ -277,11 +278,3 @@ class RunFolder:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-def _first_difference(there: Any, wanted: Any, at: str = "") -> tuple[str, Any, Any]:
-    if isinstance(there, dict) and isinstance(wanted, dict):
-        for key in [*there, *wanted]:
-            if there.get(key) != wanted.get(key):
-                return _first_difference(there.get(key), wanted.get(key), f"{at}.{key}" if at else str(key))
-    return at or "manifest", there, wanted
