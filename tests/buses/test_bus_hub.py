@@ -12,7 +12,7 @@ from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
 from adapters.buses import KnowledgeHub, Wire, hub
 from adapters.buses.messages import Beat, Dropped, Happened, Joined, State, Swapped, Table
-from adapters.buses.wire import STAGE_OF, WIRE_VERSION
+from adapters.buses.wire import ORDERED, STAGE_OF, WIRE_VERSION
 from knowledge import QTable, to_json
 from mape.errors import BusError
 
@@ -357,21 +357,21 @@ def beat(**other):
 
 
 def test_a_heartbeat_is_told_in_the_status(site, raw, joined):
-    raw.put(site.wire.beat("plan"), beat().pack())
+    raw.put(site.wire.beat("plan"), beat().pack(), **ORDERED)
     eventually(lambda: status(raw, site.wire).roles["plan"].pid == 77)
     assert status(raw, site.wire).roles["plan"].refused == 2
 
 
 def test_a_heartbeat_of_another_epoch_is_not_heeded(site, raw, joined):
-    raw.put(site.wire.beat("plan"), beat(epoch=9).pack())
-    raw.put(site.wire.beat("monitor"), beat().pack())
+    raw.put(site.wire.beat("plan"), beat(epoch=9).pack(), **ORDERED)
+    raw.put(site.wire.beat("monitor"), beat().pack(), **ORDERED)
     eventually(lambda: status(raw, site.wire).roles["monitor"].pid == 77)
     assert status(raw, site.wire).roles["plan"].pid == 1
 
 
 def test_the_status_can_be_told_whatever_a_heartbeat_says(site, raw, joined):
     append(raw, site.wire, "plan", b"junk")
-    raw.put(site.wire.beat("plan"), beat(refused=2**63 - 1).pack())
+    raw.put(site.wire.beat("plan"), beat(refused=2**63 - 1).pack(), **ORDERED)
     eventually(lambda: status(raw, site.wire).roles["plan"].refused > 2**62)
 
 
@@ -387,9 +387,9 @@ JUNK = {
 
 @pytest.mark.parametrize("payload", JUNK.values(), ids=JUNK)
 def test_a_malformed_heartbeat_is_counted_and_knowledge_goes_on(site, raw, joined, payload):
-    raw.put(site.wire.beat("plan"), payload)
+    raw.put(site.wire.beat("plan"), payload, **ORDERED)
     eventually(lambda: status(raw, site.wire).roles["plan"].refused == 1)
-    raw.put(site.wire.beat("nobody"), payload)
+    raw.put(site.wire.beat("nobody"), payload, **ORDERED)
     eventually(lambda: status(raw, site.wire).refused == 2)
     assert append(raw, site.wire, "plan", GOOD)[1] is None
 
