@@ -47,6 +47,7 @@ from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
 from knowledge import STAGES, Ack, MalformedRecord
 from mape.errors import BusError, MapekError, ResultsError
+from mape.parts import owner
 from mape.tables import first_difference
 
 logger = logging.getLogger(__name__)
@@ -56,6 +57,9 @@ SINCE_LIMIT = 512
 
 AT_ONCE = 1024
 """Most questions that are answered with one commit."""
+
+TOLD_BY_ROLES = ("begun", "aborted", "swap refused")
+"""Kinds of events that a role may tell; the others are Knowledge's own word."""
 
 TABLE_WITHIN = 5.0
 """Seconds that Execute has to hand out a Q-table."""
@@ -135,6 +139,7 @@ class KnowledgeHub:
             ledger.commit()
         self._asked: SimpleQueue[tuple[str, Any] | None] = SimpleQueue()
         self._seen = {role: _Seen() for role in ROLES}
+        self._came = False  # whether any role was here since this Knowledge listens
         self._leave: Callable[..., object] | None = None
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
@@ -222,7 +227,7 @@ class KnowledgeHub:
                 self._say(answer)
             if self.ledger.complete:
                 self.ended.set()
-                if not any(seen.tokens for seen in self._seen.values()):
+                if self._came and not any(seen.tokens for seen in self._seen.values()):
                     self.left.set()
             if asked == ("", None):
                 asked = self._asked.get()
@@ -350,7 +355,11 @@ class KnowledgeHub:
         if what == "swapped" and role in STAGE_OF:
             swapped, _ = Swapped.unpack(_payload(query, LARGEST_MESSAGE))
             self._check_epoch(role, _attachment(query))
-            loop, number = swapped.loop, swapped.pass_no
+            loop, number = self._loop(swapped.loop), swapped.pass_no
+            if owner(swapped.part) != role:
+                raise _Refused(f"{swapped.part} is a part of {owner(swapped.part)}, not of {role}")
+            if not swapped.planned and number <= self.ledger.last(loop)[STAGE_OF[role]]:
+                raise _Refused(f"pass {number} has been made with the part before; {swapped.part} is replaced after it")
             self.ledger.swapped(Swap(loop, number, swapped.part, swapped.to, swapped.handed_over, swapped.planned))
             if not swapped.planned:
                 text = f"from pass {number} on, {swapped.part} is {json.dumps(swapped.to)}"
@@ -358,6 +367,9 @@ class KnowledgeHub:
             return _Answer(query, b"ok")
         if what == "event" and role in STAGE_OF:
             happened, _ = Happened.unpack(_payload(query, LARGEST_MESSAGE))
+            self._check_epoch(role, _attachment(query))
+            if happened.kind not in TOLD_BY_ROLES:
+                raise _Refused(f"a role tells of {', '.join(TOLD_BY_ROLES)}; not of {happened.kind!r}")
             if happened.kind == "begun":  # one per episode: only the last of them counts
                 if role != "execute" or happened.loop is None or happened.pass_no is None:
                     raise _Refused("only Execute begins episodes, and names its loop and episode")
@@ -385,7 +397,7 @@ class KnowledgeHub:
                 f"{role} has another config than Knowledge: {name} is {there!r} there, and {here!r} here. Give both "
                 "the same file and the same --set"
             )
-        if join.layout is not None:
+        if join.layout is not None and role == "execute":
             self.ledger.begin(_facts(join.layout))
         seen = self._seen[role]
         seen.pid, seen.host, seen.beat, seen.beat_at = join.pid, join.host, None, time.monotonic()
@@ -506,6 +518,7 @@ class KnowledgeHub:
             return
         if sample.kind == zenoh.SampleKind.PUT:
             self._seen[role].tokens.add(int(epoch))
+            self._came = True
         else:
             self._seen[role].tokens.discard(int(epoch))
 

@@ -183,10 +183,11 @@ class Member:
         while True:
             try:
                 return self.wire.join(self.role, 0.5)
-            except BusError:
+            except BusError as error:
                 if deadline is not None and time.monotonic() > deadline:
                     raise
-                self._say(f"waiting for Knowledge on {self.wire.endpoint}")
+                trusted = "" if self.wire.tls is None else f" ({error})"
+                self._say(f"waiting for Knowledge on {self.wire.endpoint}{trusted}")
 
     def _join(self, deadline: float | None) -> None:
         join = Join(
@@ -366,6 +367,8 @@ class Member:
             if now >= self._kept_up_at:
                 self._keep_up(now)
             if self._waiting:
+                if not self._arrived.empty():
+                    self._take_in(0.0)  # acknowledgements do not wait until there is nothing else to do
                 return self._waiting.popleft()
             left = deadline - now
             if looked and left < 0:
@@ -461,13 +464,16 @@ class Member:
         self._deaf_since = None
         lines = reply.ok.payload.to_bytes().splitlines()
         self._fetched.discard(int(lines[0]))
+        news = False
         for line in lines[1:]:
             record = from_json(line)
             expected = self._next.get(record.loop)
             if expected is not None and record.pass_no >= expected:
                 self._next[record.loop] = record.pass_no + 1
                 self._waiting.append(record)
-        if len(lines) > SINCE_LIMIT and int(lines[0]) in self._next:
+                news = True
+        # An answer that was read late, after its question was asked again, asks for no more.
+        if news and len(lines) > SINCE_LIMIT and int(lines[0]) in self._next:
             self._fetch(int(lines[0]))
 
     # Questions.
@@ -546,9 +552,9 @@ class Member:
         """Note an event beside the records; `surely` waits for the answer."""
         what, payload = f"event/{self.role}", Happened(kind=kind, text=text, loop=loop, pass_no=number).pack()
         if surely:
-            self.ask(what, payload)
+            self.ask(what, payload, self._epoch)
         else:
-            self._mention(what, payload)
+            self._mention(what, payload, self._epoch)
 
     def history(self, loop: int, stages: Mapping[int, int]) -> list[Record]:
         """Return the records of the stages named, each from its pass on; as many as fit into one answer."""

@@ -1,6 +1,7 @@
 """The command line: what can be said, and what becomes of errors.
 
-Exit codes: 0 done; 1 failure; 2 usage, a config among it; 130 after Ctrl-C, with what is finished kept.
+Exit codes: 0 done; 1 failure; 2 usage, a config among it; 130 after Ctrl-C, 143 after SIGTERM, with what is finished
+kept.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ examples:
   mapek run examples/gridworld_goals.toml --show 298:305    what each part says, pass by pass
   mapek compare examples/gridworld_goals.toml --trials 50   all agents of a config on the same seeds
   mapek run examples/traffic.toml --set 'monitor.detectors=["two_window"]'
+  mapek up examples/gridworld_goals.toml                    the same loop as five processes
 
-exit codes: 0 done, 1 failure, 2 usage, 130 stopped by Ctrl-C (finished trials are kept)
+exit codes: 0 done, 1 failure, 2 usage, 130 stopped by Ctrl-C (finished trials are kept), 143 by SIGTERM
 """
 
 

@@ -92,12 +92,13 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
         say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per {unit}")
     if config.execute.mode == "free":
         say(chosen, "log:      no hash, as no free-running loop is the same twice")
-        say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)}")
     elif config.units == 1:
         say(chosen, f"log:      {results[0].log_sha256}")
-        say(chosen, f"Q-table:  {results[0].q_table_sha256}")
     else:
         say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)} (of all {units})")
+    if config.units == 1:
+        say(chosen, f"Q-table:  {results[0].q_table_sha256}")
+    else:
         say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)} (of all {units})")
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import gc
 import logging
 import sys
 from pathlib import Path
@@ -25,6 +27,8 @@ def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
     prepare()
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    # At its end the interpreter looks through all objects again and again; of compiled code there are many.
+    atexit.register(gc.freeze)
     if chosen.leash:
         leash()
     try:

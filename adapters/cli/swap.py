@@ -50,4 +50,6 @@ def _print(swap: Swap, to: str) -> None:
     first, last = min(swap.passes), max(swap.passes)
     when = f"pass {first}" if first == last else f"passes {first} to {last} of {len(swap.passes)} loops"
     kept = "with the state of the one before" if swap.handed_over else "from a fresh start"
+    if swap.part == "learner":  # it has no state
+        kept = "and the Q-table goes on"
     print(f"from {when} on, {swap.part} is {to}, {kept}")

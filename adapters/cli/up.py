@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
+import gc
 import sys
 import tempfile
 import time
@@ -26,6 +28,7 @@ from mape.config import Config
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
+    atexit.register(gc.freeze)  # as in `serve`
     try:
         with terminated_by_signal():
             return _run(chosen)
@@ -94,7 +97,7 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         **{role: command_of(role, path, "--connect", wire.endpoint, *shared) for role in ROLES},
     }
     screen = Screen(chosen, config)
-    with Supervisor(wire, commands, logs, hang_after=chosen.hang_after) as supervisor, screen:
+    with Supervisor(wire, commands, logs, hang_after=chosen.hang_after, tell=screen.tell) as supervisor, screen:
         supervisor.watch(screen.show)
         restarts = {role: child.restarts for role, child in supervisor.children.items() if child.restarts}
     if restarts:
@@ -132,6 +135,13 @@ class Screen:
     def __exit__(self, *error: Any) -> None:
         if self._live is not None:
             self._live.__exit__(*error)
+
+    def tell(self, sentence: str) -> None:
+        """Say something beside the table."""
+        if self._live is not None:
+            self._live.console.print(sentence)
+        else:
+            print(f"mapek: {sentence}", file=sys.stderr, flush=True)
 
     def show(self, supervisor: Supervisor) -> None:
         """Show how far the run is."""

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from adapters.buses.hub import KnowledgeHub, versions
 from adapters.buses.member import Member
@@ -38,17 +39,29 @@ class Terminated(BaseException):
 @contextlib.contextmanager
 def terminated_by_signal() -> Iterator[None]:
     """Let SIGTERM end what runs here as Ctrl-C does: by an exception, so that sessions are closed."""
+    signals = {Terminated: signal.SIGTERM, KeyboardInterrupt: signal.SIGINT}
 
     def raise_it(number: int, frame: FrameType | None) -> None:
         # Once: what cleans up then is not to be broken off by the next signal.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise Terminated
 
+    def raise_again(lost: Any) -> None:
+        # Python was just in a finaliser, out of which no exception comes: a moment later it is elsewhere.
+        if lost.exc_type not in signals:
+            hook(lost)
+            return
+        if lost.exc_type is Terminated:
+            signal.signal(signal.SIGTERM, raise_it)
+        threading.Timer(0.01, os.kill, (os.getpid(), signals[lost.exc_type])).start()
+
+    hook, sys.unraisablehook = sys.unraisablehook, raise_again
     before = signal.signal(signal.SIGTERM, raise_it)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = hook
 
 
 def leash() -> None:
@@ -122,7 +135,7 @@ def serve_role(config: Config, role: str, wire: Wire) -> None:
     MapekError
         A part or the system failed, or Knowledge refuses this role.
     """
-    from adapters.processes.role import make_role
+    from adapters.processes.roles import make_role
 
     quick_switches()
 

@@ -37,10 +37,13 @@ ENDS_WITHIN = 1.5
 """Seconds that a process has to end after SIGTERM, before SIGKILL."""
 
 STARTS_WITHIN = 30.0
-"""Seconds that Knowledge has for its start, before its silence counts."""
+"""Seconds that a process has for its start at least, before its silence counts."""
 
-CRASHES, CRASHES_WITHIN = 10, 10.0
-"""So many deaths of one role in so many seconds without a pass in between, and the run is given up."""
+CRASHES = 10
+"""So many deaths of one role without a pass in between, and the run is given up."""
+
+FRESH = 3.0
+"""Seconds for which Knowledge's word on who is hung is believed."""
 
 
 class Failed(MapekError):
@@ -59,6 +62,7 @@ class Child:
         self.started_at = 0.0
         self.deaths: deque[tuple[float, int]] = deque(maxlen=CRASHES)
         self.errors = 0
+        self.hung = 0
         self.done = False
 
     @property
@@ -124,11 +128,22 @@ class Supervisor:
         Folder for what they write.
     hang_after
         Seconds after which a process that is alive and silent is taken for hung.
+    tell
+        Told, as a sentence, what is done about a process.
     """
 
-    def __init__(self, wire: Wire, commands: dict[str, list[str]], logs: Path, *, hang_after: float = 60.0) -> None:
+    def __init__(
+        self,
+        wire: Wire,
+        commands: dict[str, list[str]],
+        logs: Path,
+        *,
+        hang_after: float = 60.0,
+        tell: Callable[[str], object] = lambda sentence: None,
+    ) -> None:
         self.wire = wire
         self.hang_after = hang_after
+        self.tell = tell
         self.children = {role: Child(role, command, logs / f"{role}.log") for role, command in commands.items()}
         self.status: Status | None = None
         self._heard_at = 0.0
@@ -195,28 +210,36 @@ class Supervisor:
                     f"{child.role} failed twice at the same place: {_last_sentence(child)} What was acknowledged is "
                     "kept."
                 )
-        oldest, passes = child.deaths[0]
-        if len(child.deaths) == CRASHES and now - oldest < CRASHES_WITHIN and passes == self._passes:
+        if len(child.deaths) == CRASHES and child.deaths[0][1] == self._passes:
             raise Failed(
-                f"{child.role} died {CRASHES} times within {now - oldest:.0f} s, without a pass in between (exit code "
-                f"{code}): {_last_sentence(child)} What was acknowledged is kept."
+                f"{child.role} died {CRASHES} times within {now - child.deaths[0][0]:.0f} s, without a pass in between "
+                f"({self._why(child, code)}): {_last_sentence(child)} What was acknowledged is kept."
             )
         child.start()
 
+    def _why(self, child: Child, code: int) -> str:
+        if child.hung:
+            return f"silent for {self.hang_after:g} s; if an episode takes longer, give a longer --hang-after"
+        return f"exit code {code}"
+
     def _is_hung(self, child: Child) -> None:
-        if time.monotonic() - child.started_at < self.hang_after:
-            return
+        now = time.monotonic()
+        silent = now - child.started_at
         if child.role == KNOWLEDGE:
-            if self._heard_at < child.started_at:  # it has not said its first word yet
-                silent = time.monotonic() - child.started_at - STARTS_WITHIN
-            else:
-                silent = time.monotonic() - self._heard_at
+            spoke = self._heard_at > child.started_at
+            silent = min(silent, now - self._heard_at)
         else:
             role = None if self.status is None else self.status.roles.get(child.role)
-            if role is None or role.pid != child.pid or role.beat_age is None:
-                return
-            silent = role.beat_age
-        if silent > self.hang_after:
+            if role is None or now - self._heard_at > FRESH:
+                return  # who is hung, Knowledge tells
+            spoke = role.pid == child.pid  # else it has not joined since its start
+            if spoke:
+                silent = min(silent, role.beat_age or 0.0)
+        if silent > (self.hang_after if spoke else max(self.hang_after, STARTS_WITHIN)):
+            child.hung += 1
+            self.tell(
+                f"{child.role} (process {child.pid}) was silent for {silent:.1f} s; it is killed and started again"
+            )
             child.kill()
 
     def _ask(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -25,11 +26,11 @@ from knowledge import (
 )
 from mape.errors import BusError, ResultsError
 
-WINDOW = 256
-"""Finished passes of each loop that stay in memory."""
+WINDOW = 1
+"""Finished passes of each loop that stay in memory; what is older is read from the store."""
 
 EVENTS_KEPT = 1000
-"""Refusals that are noted one by one; after that they are only counted."""
+"""Events of one kind that are noted one by one, since Knowledge's start; after that they are only counted."""
 
 
 class Conflict(BusError):
@@ -73,6 +74,7 @@ class Ledger:
         self.free = free
         self.layout: RowLayout | None = None
         self.refused = 0
+        self._noted: Counter[str] = Counter()
         self._epochs: dict[str, int] = {}
         self._logs: list[Log | FreeLog] = []
         self._fit: _Fit | None = None
@@ -196,6 +198,8 @@ class Ledger:
         """Keep a role's state, if the log holds the record after which it was."""
         last = self.last(snapshot.loop)[stage]
         final = snapshot.final and role == "execute"
+        if final and snapshot.pass_no != self.episodes:
+            raise MalformedRecord(f"a state of pass {snapshot.pass_no} is not the last one of {self.episodes} passes")
         if snapshot.pass_no > (self.last(snapshot.loop)[3] if final else last):
             return Taken(Ack.GAP, last)
         self.store.keep_snapshot(snapshot)
@@ -209,11 +213,11 @@ class Ledger:
         self.store.keep_swap(swap)
 
     def note(self, role: str, kind: str, text: str, loop: int | None = None, number: int | None = None) -> None:
-        """Note what happened beside the records; of refusals the first thousand, and the number of all."""
-        if kind == "refused":
-            self.refused += 1
-            if self.refused > EVENTS_KEPT:
-                return
+        """Note what happened beside the records: of each kind the first thousand, and the number of all refusals."""
+        self.refused += kind == "refused"
+        self._noted[kind] += 1
+        if self._noted[kind] > EVENTS_KEPT:
+            return
         self.store.event(role, kind, text, loop, number)
 
     @property
@@ -285,6 +289,8 @@ class Ledger:
         rows = self.store.rows(loop)
         next(rows)  # plan 0's
         log.restore(start, rows, passes, records[finished:])
+        if self.store.count(loop) != 1 + sum(last):
+            raise ValueError(f"loop {loop} lacks records before its last ones")
         return log
 
 

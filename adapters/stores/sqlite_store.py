@@ -67,7 +67,7 @@ CREATE TABLE events (
 );
 """
 
-SNAPSHOTS_KEPT = 2
+SNAPSHOTS_KEPT = 1
 
 
 class Snapshot(NamedTuple):
@@ -262,6 +262,10 @@ class Store:
         query = "SELECT pass FROM records WHERE loop = ? AND stage = ? ORDER BY pass DESC LIMIT 1"
         seen, symptom, request, plan = (self._number(query, loop, stage) for stage in range(4))
         return max(0, seen), max(0, symptom), max(0, request), plan
+
+    def count(self, loop: int) -> int:
+        """Return the number of a loop's records."""
+        return self._number("SELECT count(*) FROM records WHERE loop = ?", loop)
 
     def since(self, loop: int, stages: Mapping[int, int], limit: int) -> list[tuple[int, int, str]]:
         """Return (pass, stage, body) of the stages named, each from its pass on, in order of pass and stage."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from adapters.buses import KnowledgeHub, Member
 from adapters.buses.hub import versions
-from adapters.processes.role import make_role
+from adapters.processes.roles import make_role
 from adapters.processes.serve import open_ledger
 from adapters.systems import make_system
 from mape.config import load

@@ -304,7 +304,7 @@ def test_what_is_brought_out_of_place_is_refused_and_changes_nothing(
 def test_the_last_episode_that_was_begun_is_told_to_who_joins(site, raw, joined):
     for number in (1, 2):
         said = Happened(kind="begun", text="", loop=0, pass_no=number).pack()
-        assert ask(raw, site.wire.ask("event/execute"), said) == (b"ok", None)
+        assert ask(raw, site.wire.ask("event/execute"), said, b"1") == (b"ok", None)
     reply, _ = ask(raw, site.wire.ask("join/execute"), join_of("execute"))
     assert Joined.unpack(reply)[0].begun == (2,)
 

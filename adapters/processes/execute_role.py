@@ -1,0 +1,279 @@
+"""Execute in a process of its own: in lockstep with the plans, or at the managed system's own rate."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from adapters.buses.member import Asked, Member
+from adapters.buses.messages import State, Table
+from adapters.processes.replacing import Unit, Wanted
+from adapters.processes.role import IDLE, Role, plain
+from knowledge import ChangePlan, Observation, QTable, Record
+from mape.config import Config
+from mape.errors import BusError, MapekError
+from mape.execute import Execute
+from mape.execute.adoption import fitting
+from mape.loop import build_execute
+
+HEARD_AT_LEAST = 0.002
+"""Seconds between two episodes in which plans are put in force, even if the next one is due."""
+
+
+class ExecuteRole(Role):
+    """Execute of all loops, with their managed systems; in lockstep it waits for each plan."""
+
+    first = 0
+
+    def __init__(self, name: str, config: Config, member: Member, systems: list[Any]) -> None:
+        super().__init__(name, config, member)
+        self.systems = systems
+        self.free = config.execute.mode == "free"
+
+    def begin(self) -> None:
+        """Make each loop's component, and restore it."""
+        from adapters.systems import make_system
+
+        while len(self.systems) < self.member.joined.units:
+            self.systems.append(make_system(self.config.system))
+        super().begin()
+
+    def make(self, unit: Unit) -> None:
+        """Give a loop its component."""
+        unit.knowledge = self._knowledge(unit)
+        trial, loop = divmod(unit.loop, self.config.loops)
+        unit.component = build_execute(
+            self.config, self.systems[unit.loop], unit.knowledge, unit.outbox.append, trial, loop
+        )
+
+    def start(self, unit: Unit) -> None:
+        """Do nothing: plan 0 begins the loop."""
+
+    def take_up(self, unit: Unit, state: State, table: QTable | None) -> None:
+        """Restore a loop's component, and note an episode that was broken off and cannot be driven again."""
+        if table is None:
+            raise BusError(f"the state of execute at pass {state.pass_no} has no Q-table")
+        unit.component.restore(state.state, table)
+        if state.final:
+            unit.done = True
+            return
+        # In lockstep that is the plan of the state's own pass; who runs freely may be further behind with its plans.
+        in_force = unit.component.plan
+        self.member.watch(unit.loop, 0 if in_force is None else in_force.pass_no + 1)
+
+    def _restore(self, unit: Unit) -> None:
+        super()._restore(unit)
+        begun = self.member.joined.begun[unit.loop]
+        if begun > unit.component.passes and not self.systems[unit.loop].redrivable and not unit.done:
+            self.member.note(
+                "aborted",
+                f"episode {begun} was broken off with its process, and the system cannot be driven through it again; "
+                "it was begun anew",
+                unit.loop,
+                begun,
+            )
+
+    def _handle(self, unit: Unit, record: Record) -> None:
+        assert isinstance(record, ChangePlan)
+        execute: Execute = unit.component
+        execute.adopt(record)
+        if record.pass_no < self.config.episodes:
+            self.drive(unit)
+
+    def _take(self, unit: Unit, record: Record) -> None:
+        # A swap at pass n is made before episode n, which is driven under plan n - 1.
+        if unit.done:
+            return
+        if record.pass_no < self.config.episodes and self.may_replace(unit, record.pass_no + 1):
+            self._try(unit, record)
+        else:
+            self._handle(unit, record)
+        self._flush(unit)
+        if record.pass_no >= self.config.episodes:
+            self.finish(unit)
+
+    def drive(self, unit: Unit) -> None:
+        """Drive the next episode."""
+        number = unit.component.passes + 1
+        self._swap(unit, number)
+        if not self.systems[unit.loop].redrivable:
+            self.member.note("begun", "", unit.loop, number, surely=not self.free)
+        unit.component.drive()
+
+    def finish(self, unit: Unit) -> None:
+        """Have the Q-table at the end kept."""
+        if unit.wanted is not None:
+            self._refuse(unit.wanted, "the run is over")
+        state, table = unit.component.state()
+        self.member.unwatch(unit.loop)
+        self.member.settle()
+        final = State(loop=unit.loop, pass_no=unit.component.passes, state=plain(state), final=True)
+        self.member.keep_surely(final, table)
+        unit.done = True
+
+    def send(self, unit: Unit, record: Record) -> None:
+        """Send an Observation; of a system that cannot be driven again with the state behind it."""
+        if self.systems[unit.loop].redrivable:
+            self.member.send(record)
+            return
+        state, table = unit.component.state()
+        packed = State(loop=unit.loop, pass_no=record.pass_no, state=plain(state)).pack(table)
+        self.member.send(record, packed)
+
+    def keep(self, unit: Unit) -> None:
+        """Have a loop's state and Q-table kept at Knowledge."""
+        if self.systems[unit.loop].redrivable:
+            state, table = unit.component.state()
+            self.member.keep(State(loop=unit.loop, pass_no=unit.sent, state=plain(state)), table)
+
+    def _try(self, unit: Unit, record: Record) -> None:
+        wanted, unit.wanted = unit.wanted, None
+        assert wanted is not None
+        assert isinstance(record, ChangePlan)
+        unit.component.adopt(record)
+        self._drive_with(unit, wanted)
+
+    def _drive_with(self, unit: Unit, wanted: Wanted) -> None:
+        """Drive the next episode with the new learner; if it fails, with the old one."""
+        execute: Execute = unit.component
+        number = execute.passes + 1
+        self._swap(unit, number)  # what the config plans comes first, whoever drives this episode
+        old, config = execute.learner, unit.config
+        try:
+            handed_over = self._replace(unit, wanted.part, wanted.spec)
+            self.drive(unit)
+        except MapekError as error:
+            unit.outbox.clear()
+            execute.replace(old)
+            unit.config = config
+            self._refuse(wanted, str(error))
+            self.drive(unit)
+            return
+        self._took(unit, wanted, number, handed_over)
+
+    def hand_out(self, asked: Asked) -> None:
+        """Hand out the Q-table at the end of the episode that is asked for, which is the last one in lockstep."""
+        control = asked.control
+        if not 0 <= (control.loop or 0) < len(self.units):
+            raise BusError(f"loop {control.loop}; this run has loops 0 to {len(self.units) - 1}")
+        unit = self.units[control.loop or 0]
+        passes, asked_for = unit.component.passes, control.pass_no or 0
+        if asked_for > passes or (asked_for < passes and not self.free):
+            raise BusError(f"Execute is at pass {unit.component.passes}, not at the end of {control.pass_no}")
+        table = unit.component.q_table.copy()
+        self.member.answer(asked, Table(loop=unit.loop, pass_no=control.pass_no).pack(table))
+
+
+class FreeExecuteRole(ExecuteRole):
+    """Execute whose managed systems are paced by their own rate and never wait.
+
+    Each episode is driven under the newest plan that has come; all that came are put in force, in order. What cannot be
+    sent fast enough is held back, at most `execute.backlog` Observations of each loop; what is beyond that is dropped,
+    and said in one record when Knowledge takes records again.
+    """
+
+    def run(self) -> None:
+        """Join, restore, and drive at the system's rate until all loops are done, or `stopping` is set."""
+        rate = self.config.execute.rate
+        assert rate is not None
+        with self.member:
+            self.begin()
+            for unit in self.units:
+                self._catch_up(unit)
+            due = time.monotonic()
+            while not self.stopping.is_set() and not all(unit.done for unit in self.units):
+                self._hear(due, 0.5 / rate)
+                if self._vetted:
+                    self._let_in()
+                if time.monotonic() < due:
+                    continue
+                # Behind by more than a second, it is not caught up: the rate is the system's own.
+                due = max(due + 1.0 / rate, time.monotonic() - 1.0)
+                for unit in self.units:
+                    self._tick(unit)
+            self._refuse_all()
+            if not self.stopping.is_set():
+                self.member.settle()
+
+    def _hear(self, due: float, most: float) -> None:
+        """Put in force what comes until the next episode is due; of what has come, for a while even if it is."""
+        came = self.member.receive(max(0.0, min(due - time.monotonic(), IDLE)))
+        until = max(due, time.monotonic() + max(most, HEARD_AT_LEAST))
+        while came is not None:
+            if isinstance(came, Asked):
+                self._asked(came)
+            else:
+                self._adopt(self.units[came.loop], came)
+            came = self.member.receive(0.0) if time.monotonic() < until else None
+
+    def _catch_up(self, unit: Unit) -> None:
+        """Drive again what is in the log after the restored state, each episode under the plan that it names.
+
+        What dropped episodes taught is lost. What is driven again after them may differ, and is not sent again.
+        """
+        last = self.member.joined.last[unit.loop][0]
+        same, plans = True, dict[int, ChangePlan]()
+        while unit.component.passes < last:
+            found = self.member.history(unit.loop, {0: unit.component.passes + 1})
+            seen = [record for record in found if isinstance(record, Observation)]
+            if not seen:
+                unit.component.passes = last  # the last ones were dropped
+            for record in seen:
+                same = same and record.pass_no == unit.component.passes + 1
+                unit.component.passes = record.pass_no - 1
+                self.member.beat()
+                self._adopt_up_to(unit, record.plan, plans)
+                self.drive(unit)
+                if self.member.unacknowledged(unit.loop) >= self.config.execute.backlog:
+                    self.member.settle()  # it is in the log, and is not to be dropped
+                if same:
+                    self._flush(unit)
+                unit.outbox.clear()
+        unit.sent = max(unit.sent, unit.component.passes)
+
+    def _adopt_up_to(self, unit: Unit, number: int, plans: dict[int, ChangePlan]) -> None:
+        execute: Execute = unit.component
+        at = -1 if execute.plan is None else execute.plan.pass_no
+        while at < number:
+            if not plans:
+                # Episodes that were dropped have no plans: the next one there is follows.
+                found = self.member.history(unit.loop, {3: at + 1})
+                plans.update({plan.pass_no: plan for plan in found if isinstance(plan, ChangePlan)})
+            at = min(plans, default=number + 1)
+            if at <= number:
+                execute.adopt(fitting(plans.pop(at), execute.q_table.actions))
+
+    def _adopt(self, unit: Unit, record: Record) -> None:
+        assert isinstance(record, ChangePlan)
+        plan = unit.component.plan
+        if plan is None or record.pass_no > plan.pass_no:
+            unit.component.adopt(fitting(record, unit.component.q_table.actions))
+        if record.pass_no >= self.config.episodes:
+            self.finish(unit)
+
+    def _tick(self, unit: Unit) -> None:
+        if unit.done or unit.component.plan is None or unit.component.passes >= self.config.episodes:
+            return
+        if self.may_replace(unit, unit.component.passes + 1):
+            wanted, unit.wanted = unit.wanted, None
+            assert wanted is not None
+            self._drive_with(unit, wanted)
+        else:
+            self.drive(unit)
+        self._flush(unit)
+
+    def send(self, unit: Unit, record: Record) -> None:
+        """Send an Observation if the backlog has room; else drop it, and say so when it has again."""
+        # Once full, it is to be half empty before it takes again: each gap costs a state that is kept.
+        most = self.config.execute.backlog if unit.dropped is None else self.config.execute.backlog // 2
+        full = self.member.unacknowledged(unit.loop) > max(0, most - 1)
+        if full and record.pass_no < self.config.episodes:  # the last one ends the run, and can wait
+            unit.dropped = (record.pass_no if unit.dropped is None else unit.dropped[0], record.pass_no)
+            return
+        dropped, unit.dropped = unit.dropped, None
+        if dropped is not None:
+            self.member.drop(unit.loop, *dropped)
+        super().send(unit, record)
+        if dropped is not None:  # what the dropped episodes taught is in no record
+            state, table = unit.component.state()
+            self.member.keep(State(loop=unit.loop, pass_no=record.pass_no, state=plain(state)), table)
