@@ -58,6 +58,9 @@ SINCE_LIMIT = 512
 AT_ONCE = 1024
 """Most questions that are answered with one commit."""
 
+OF_CONFIG = "config: "
+"""What a refusal begins with that is a matter of the config."""
+
 TOLD_BY_ROLES = ("begun", "aborted", "swap refused")
 """Kinds of events that a role may tell; the others are Knowledge's own word."""
 
@@ -394,8 +397,8 @@ class KnowledgeHub:
         if self._config is not None and join.config != self._config:
             name, here, there = first_difference(self._config, join.config)
             raise _Refused(
-                f"{role} has another config than Knowledge: {name} is {there!r} there, and {here!r} here. Give both "
-                "the same file and the same --set"
+                f"{OF_CONFIG}{role} has another config than Knowledge: {name} is {there!r} in {role}, and {here!r} in "
+                "Knowledge. Give both the same file and the same --set"
             )
         if join.layout is not None and role == "execute":
             self.ledger.begin(_facts(join.layout))

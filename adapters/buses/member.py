@@ -17,11 +17,11 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from adapters.buses.hub import SINCE_LIMIT, host
+from adapters.buses.hub import OF_CONFIG, SINCE_LIMIT, host
 from adapters.buses.messages import Beat, Control, Dropped, Happened, Join, Joined, Layout, State, Swapped, Table
 from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, STAGE_OF, Wire, hand_over
 from knowledge import STAGES, MalformedRecord, QTable, Record, from_json, to_json
-from mape.errors import BusError
+from mape.errors import BusError, ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -487,6 +487,8 @@ class Member:
         ------
         Refused
             It says no, and why.
+        ConfigError
+            It has another config.
         BusError
             It does not answer within the patience.
         """
@@ -506,6 +508,8 @@ class Member:
                     self._deaf_since = None
                     return bytes(reply.ok.payload.to_bytes())
                 outcome = "Timeout" if reply.err is None else reply.err.payload.to_string()
+                if outcome.startswith(OF_CONFIG):
+                    raise ConfigError(outcome.removeprefix(OF_CONFIG))
                 if outcome != "Timeout" and not outcome.startswith("later: "):
                     raise Refused(f"{self.role} is refused by Knowledge: {outcome}")
             if outcome == "Timeout":

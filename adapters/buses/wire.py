@@ -261,4 +261,5 @@ def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise BusError(f"{otherwise} ({error})") from error
+        # Of what Zenoh says, the places in its sources help nobody here.
+        raise BusError(f"{otherwise} ({re.split(r'[.]? at /', str(error))[0]})") from error

@@ -226,8 +226,8 @@ def _tables(chosen: argparse.Namespace, folder: Path) -> int:
         print(f"{trials}, {found.episodes:,} episodes in all, run again: ", end="")
         if found.difference is None:
             print("no difference")
-            print(f"log:      {found.log_sha256} (of all trials)")
-            print(f"Q-tables: {found.q_table_sha256} (of all trials)")
+            print(f"log:      {found.log_sha256} (hash of the trials' hashes)")
+            print(f"Q-tables: {found.q_table_sha256} (hash of the trials' hashes)")
             print("result.json says the same")
         else:
             print(f"the first difference: {found.difference}")

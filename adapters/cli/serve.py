@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from adapters.buses.wire import Wire, system_segment
-from adapters.cli.common import config_of, open_folder, prepare, say
+from adapters.cli.common import config_of, open_folder, prepare
 from adapters.processes.serve import (
     LOG_NAME,
     Terminated,
@@ -67,6 +67,5 @@ def _serve_with_results(chosen: argparse.Namespace, config: Config, wire: Wire, 
 
     label = chosen.agent or config.name
     with open_folder(chosen, "up", config.name, {label: config}, check=lambda config: None) as folder:
-        say(chosen, f"Knowledge listens on {wire.endpoint}; its log is {folder.path / LOG_NAME}")
         serve_knowledge(config, wire, folder.path / LOG_NAME, **kept)  # type: ignore[arg-type]
         up.conclude(chosen, config, label, folder)

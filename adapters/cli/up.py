@@ -6,6 +6,7 @@ import argparse
 import atexit
 import contextlib
 import gc
+import json
 import sys
 import tempfile
 import time
@@ -22,8 +23,10 @@ from adapters.processes.export import export
 from adapters.processes.serve import LOG_NAME, Terminated, open_ledger, terminated_by_signal
 from adapters.processes.supervise import KNOWLEDGE, Supervisor, command_of
 from adapters.results import RunFolder
+from adapters.stores import Swap
 from knowledge import from_json
 from mape.config import Config
+from mape.trials import TrialResult
 
 
 def execute(chosen: argparse.Namespace) -> int:
@@ -57,9 +60,17 @@ def _run(chosen: argparse.Namespace) -> int:
 
 def conclude(chosen: argparse.Namespace, config: Config, label: str, folder: RunFolder) -> None:
     """Make of Knowledge's log what `mapek run` makes: tables, summary, figures."""
-    results = _collect(config, label, folder)
+    results, live = _collect(config, label, folder)
     result = as_json(config, results)
+    if live:
+        result["live_swaps"] = [
+            {"loop": s.loop, "pass": s.pass_no, "part": s.part, "to": s.spec, "handed_over": s.handed_over}
+            for s in live
+        ]
     report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
+    for swap in live:
+        loop = f", loop {swap.loop}" if config.units > 1 else ""
+        say(chosen, f"swapped:  {swap.part} is {json.dumps(swap.spec)} from pass {swap.pass_no} on{loop}")
     figures = []
     if not chosen.no_figures:
         from adapters.experiments.pictures import pictures_of_run
@@ -96,6 +107,8 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         ),
         **{role: command_of(role, path, "--connect", wire.endpoint, *shared) for role in ROLES},
     }
+    if not chosen.quiet:
+        print(f"five processes meet on {wire.endpoint}; the log is {folder.path / LOG_NAME}", file=sys.stderr)
     screen = Screen(chosen, config)
     with Supervisor(wire, commands, logs, hang_after=chosen.hang_after, tell=screen.tell) as supervisor, screen:
         supervisor.watch(screen.show)
@@ -104,12 +117,14 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         say(chosen, "restarts: " + ", ".join(f"{role} {count}" for role, count in restarts.items()))
 
 
-def _collect(config: Config, label: str, folder: RunFolder) -> list[Any]:
+def _collect(config: Config, label: str, folder: RunFolder) -> tuple[list[TrialResult], list[Swap]]:
+    """Return the results, and the parts that were replaced while the loops ran."""
     ledger = open_ledger(config, folder.path / LOG_NAME, "normal")
     with ledger.store:
         results = export(config, ledger, Path(folder.chunk_stem(label, 0, config.units)))
+        live = [swap for swap in ledger.store.swaps() if not swap.planned]
     folder.assemble(label)
-    return results
+    return results, live
 
 
 class Screen:

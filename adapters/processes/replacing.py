@@ -146,7 +146,7 @@ class Replacing:
         if not faults and any(unit.wanted is not None for unit in running):
             faults = ["another part is just being replaced; ask again"]
         if faults:
-            self._refuse(wanted, "; ".join(faults))
+            self._refuse(wanted, faults[0] + (f" ({len(faults) - 1} more)" if len(faults) > 1 else ""))
             return
         wanted.units = len(running)
         for unit in running:

@@ -117,7 +117,7 @@ def serve_knowledge(
     try:
         hub = KnowledgeHub(ledger, wire, json.loads(config.to_json()), versions(), snapshot_every)
         with hub:
-            logger.info("Knowledge listens on %s", wire.endpoint)
+            logger.info("Knowledge listens on %s; its log is %s", wire.endpoint, path or "in memory")
             while not hub.ended.wait(0.2):
                 pass  # in steps, so that signals are heard
             if hub.failure is not None:

@@ -173,12 +173,12 @@ def test_a_state_that_comes_with_its_record_is_kept_with_it(site, raw, joined):
         (
             "plan",
             join_of("plan", versions={"wire": str(WIRE_VERSION)}, config={"seed": 1, "plan": {"alpha": 0.2}}),
-            "plan has another config than Knowledge: plan.alpha is 0.2 there, and 0.1 here",
+            "plan has another config than Knowledge: plan.alpha is 0.2 in plan, and 0.1 in Knowledge",
         ),
         (
             "plan",
             join_of("plan", versions={"wire": str(WIRE_VERSION)}, config={"seed": 1}),
-            "plan is None there, and {'alpha': 0.1} here",
+            "plan is None in plan, and {'alpha': 0.1} in Knowledge",
         ),
     ],
 )

@@ -11,7 +11,7 @@ from adapters.buses.member import Asked, Refused
 from adapters.buses.messages import Control, State, Swapped, Table
 from adapters.buses.wire import INPUT, ORDERED, ROLES
 from knowledge import Observation, QTable, to_json
-from mape.errors import BusError
+from mape.errors import BusError, ConfigError
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -328,7 +328,9 @@ def test_one_that_was_superseded_is_told_so(site, all_four):
 def test_who_has_another_config_does_not_join(wire):
     with (
         hub.KnowledgeHub(new_ledger(), wire, {"seed": 1}),
-        pytest.raises(Refused, match="monitor has another config than Knowledge: seed is 2 there, and 1 here"),
+        pytest.raises(
+            ConfigError, match="monitor has another config than Knowledge: seed is 2 in monitor, and 1 in Know"
+        ),
     ):
         Member(wire, "monitor", config={"seed": 2}).connect()
 
