@@ -6,6 +6,7 @@ import argparse
 import atexit
 import gc
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -49,6 +50,8 @@ def _serve(chosen: argparse.Namespace) -> int:
         )
     tls = None if chosen.tls is None else Path(chosen.tls)
     wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure)
+    if tls is not None:
+        _keep_standard_output()
     if not knowledge:
         serve_role(config, chosen.role, wire)
         return 0
@@ -59,6 +62,14 @@ def _serve(chosen: argparse.Namespace) -> int:
         return 0
     _serve_with_results(chosen, config, wire, kept)
     return 0
+
+
+def _keep_standard_output() -> None:
+    """Lead what Zenoh writes of refusals to standard error; it knows standard output only, where results may go."""
+    sys.stdout.flush()
+    ours = os.dup(1)
+    os.dup2(2, 1)
+    sys.stdout = os.fdopen(ours, "w", encoding="utf-8")
 
 
 def _serve_with_results(chosen: argparse.Namespace, config: Config, wire: Wire, kept: dict[str, object]) -> None:

@@ -14,7 +14,8 @@ from mape.registry import PARTS
 
 GOALS = EXAMPLES / "gridworld_goals.toml"
 QUIETLY = ("--no-figures", "-q", "--workers", 1)
-CONFIGS = sorted(EXAMPLES.glob("*.toml"))
+# Those that extend another one, for swaps, loops or processes, are run as they stand beside the README's own lines.
+CONFIGS = sorted(path for path in EXAMPLES.glob("*.toml") if "extends" not in path.read_text())
 COMMANDS = ("run", "compare", "reproduce", "step", "list", "check")
 BESIDE_PYTHON = str(Path(sys.executable).with_name("mapek"))
 

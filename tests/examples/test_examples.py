@@ -1,19 +1,29 @@
 """The README's promises: its examples are the files, each is short and runs as it stands, and its commands exist."""
 
+import contextlib
+import json
 import os
 import re
 import shlex
+import socket
+import sqlite3
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from adapters.cli.main import parser
+from adapters.systems import make_system
+from knowledge import from_json
+from mape import load, run_trial
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
+WATCH = ROOT / "examples" / "watch_the_log.py"  # needs a run to be watched
+SCRIPTS = sorted({*(ROOT / "examples").glob("*.py")} - {WATCH})
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
@@ -49,8 +59,9 @@ def test_a_pass_is_taught_in_about_20_lines_and_says_all_four_records():
 
 
 def _commands():
-    blocks = re.findall(r"```\n(.*?)```", README, flags=re.DOTALL)
-    return [line for block in blocks for line in block.splitlines() if line.startswith("mapek ")]
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
+    lines = [line for language, block in blocks if not language for line in block.splitlines()]
+    return [line for line in lines if line.startswith("mapek ")]
 
 
 @pytest.mark.parametrize("command", _commands())
@@ -69,3 +80,164 @@ def test_a_detector_of_ones_own_is_found_from_the_command_line_in_its_folder(tmp
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "all kept" in done.stdout
+
+
+# Processes. One run of `mapek up` and one of five `mapek serve` are shared by the tests that look at them.
+
+MAPEK = (sys.executable, "-m", "mape")
+
+
+def _typed(command, cwd, code=0):
+    """Type a line of the README in a folder that has the examples."""
+    words = shlex.split(command)
+    start = MAPEK if words[0] == "mapek" else (sys.executable,)
+    done = subprocess.run([*start, *words[1:]], cwd=cwd, capture_output=True, text=True, timeout=120)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def _lines(start):
+    found = [command for command in _commands() if command.startswith(start)]
+    assert found, f"the README has no line {start}"
+    return found
+
+
+def _passes(said):
+    return [int(number) for number in re.findall(r"pass (\d+)$", said, flags=re.MULTILINE)]
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "examples").symlink_to(ROOT / "examples")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return run_trial(load(ROOT / "examples" / "gridworld_goals.toml"), 0, make_system)
+
+
+@pytest.fixture(scope="module")
+def goals(here):
+    (command,) = _lines("mapek up examples/gridworld_goals.toml")
+    _typed(f"{command} -q --no-figures", here)
+    return here / "results" / "goals"
+
+
+@pytest.fixture(scope="module")
+def served(here):
+    """The README's five lines, with Plan as the last; what `status` said before it, and what was seen of the log."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    lines = [line.replace("7447", port) for line in _lines("mapek serve") if "--tls" not in line]
+    assert [shlex.split(line)[4] for line in lines] == ["knowledge", "monitor", "analyze", "plan", "execute"]
+    lines.append(lines.pop(3))
+    lines[0] += " -q --no-figures"
+    with contextlib.ExitStack() as opened:
+
+        def start(arguments, name):
+            said = opened.enter_context(open(here / name, "w"))
+            process = subprocess.Popen([*arguments], cwd=here, stdout=said, stderr=subprocess.STDOUT)
+            opened.callback(process.wait)
+            opened.callback(process.kill)
+            return process
+
+        started = [start([*MAPEK, *shlex.split(line)[1:]], f"{n}.said") for n, line in enumerate(lines[:4])]
+        (status,) = (line.replace("7447", port) for line in _lines("mapek status") if "--tls" not in line)
+        deadline, pause, said = time.monotonic() + 60, threading.Event(), ""
+        while said.count(" here ") < 4:  # all but Plan
+            assert time.monotonic() < deadline, said
+            asked = subprocess.run([*MAPEK, *shlex.split(status)[1:]], cwd=here, capture_output=True, text=True)
+            said = asked.stdout
+            pause.wait(0.05)
+        folder = here / "results" / "served"
+        started.append(start([sys.executable, WATCH, folder], "watch.said"))
+        started.append(start([*MAPEK, *shlex.split(lines[4])[1:]], "4.said"))
+        for process in started:
+            assert process.wait(90) == 0, [path.read_text() for path in sorted(here.glob("*.said"))]
+    return folder, said, (here / "watch.said").read_text()
+
+
+def _hashes(folder):
+    (one,) = json.loads((folder / "result.json").read_bytes())["trials"]
+    return one["log_sha256"], one["q_table_sha256"]
+
+
+def test_the_readmes_processes_come_to_the_hashes_of_one_process(goals, served, alone):
+    assert _hashes(goals) == _hashes(served[0]) == (alone.log_sha256, alone.q_table_sha256)
+
+
+def test_status_says_who_is_there_and_who_is_not(served):
+    states = dict(re.findall(r"^(\w+) +(here|away)", served[1], flags=re.MULTILINE))
+    assert states == dict.fromkeys(("execute", "monitor", "analyze", "knowledge"), "here") | {"plan": "away"}
+
+
+def test_each_drift_and_the_plan_that_answered_it_are_seen_while_the_run_goes_on_and_later(goals, served, here, alone):
+    (line,) = re.findall(r"`(python examples/watch_the_log.py \S+)`", README)
+    for said in (served[2], _typed(line, here)):
+        assert _passes(said) == [*alone.alarms]
+        assert said.count("Analyze   return drifted down.") == said.count("epsilon 1.000") == len(alone.alarms)
+
+
+def test_watching_without_a_folder_says_how_it_is_done(here):
+    assert "watch_the_log.py DIR" in _typed("python examples/watch_the_log.py", here, code=1)
+
+
+def test_the_readmes_query_finds_the_drifts(goals, alone):
+    ((file, query),) = re.findall(r'^sqlite3 (\S+) "(.*)"$', README, flags=re.MULTILINE)
+    with contextlib.closing(sqlite3.connect(goals.parents[1] / file)) as log:
+        assert [number for number, _ in log.execute(query)] == [*alone.alarms]
+
+
+def test_the_readmes_lines_for_a_folder_say_what_they_are_to(goals, served, here, alone):
+    def typed(start, code=0):
+        return [_typed(line, here, code) for line in _lines(start)]
+
+    (followed,) = typed("mapek log")
+    assert _passes(followed) == [*range(1, 1501)]
+    whole, up_to = typed("mapek replay")
+    assert alone.log_sha256 in whole
+    assert "no difference" in whole
+    assert "--- after pass 303" in up_to
+    (resumed,) = typed("mapek resume results", code=1)
+    assert "nothing to continue" in resumed
+
+
+def test_the_readmes_keys_are_made(here):
+    (line,) = _lines("mapek keys")
+    assert "knowledge.lan" in _typed(line, here)
+    names = {path.stem for path in (here / "keys").glob("*.key")}
+    assert names == {"ca", "knowledge", "execute", "monitor", "analyze", "plan", "operator"}
+
+
+def test_the_example_of_swaps_makes_three_and_the_readme_shows_its_first(here):
+    text = (ROOT / "examples" / "swaps.toml").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
+    assert shown.splitlines()[1:] == text.split("[[swap]]")[1].strip().splitlines()[1:]
+
+    said = _typed("mapek run examples/swaps.toml -q --no-figures --out results/swaps", here)
+    assert re.findall(r"^pass (\d+): (\S+) is now (\S+)", said, flags=re.MULTILINE) == [
+        ("450", "plan", "morphin"), ("700", "monitor", "two_window"), ("1000", "learner", "expected_sarsa"),
+    ]  # fmt: skip
+    alarms = json.loads((here / "results" / "swaps" / "result.json").read_bytes())["trials"][0]["alarms"]
+    for drift in (301, 601, 901, 1201):
+        assert any(drift <= alarm < drift + 20 for alarm in alarms), (drift, alarms)
+
+
+def test_the_example_of_many_loops_has_four_that_differ(here):
+    _typed("mapek run examples/many_loops.toml -q --no-figures --out results/loops", here)
+    trials = json.loads((here / "results" / "loops" / "result.json").read_bytes())["trials"]
+    assert len({one["log_sha256"] for one in trials}) == len(trials) == 4
+
+
+def test_the_example_that_runs_freely_waits_for_no_plan_and_logs_how_old_each_was(here):
+    (line,) = _lines("mapek up examples/free_running.toml")
+    _typed(f"{line} --set episodes=400 -q --no-figures --out results/free", here)
+    with contextlib.closing(sqlite3.connect(here / "results" / "free" / "log.sqlite")) as log:
+        seen = [from_json(body) for (body,) in log.execute("SELECT body FROM records WHERE stage = 0 ORDER BY pass")]
+    assert [one.pass_no for one in seen] == [*range(1, 401)]
+    assert all(one.age >= 1 for one in seen)
+    assert seen[-1].plan > 0  # plans come while it runs, and are taken
+    assert "free-running needs processes" in _typed("mapek run examples/free_running.toml", here, code=2)

@@ -1,0 +1,28 @@
+"""Watch a run of `mapek up` from its folder, finished or not: python examples/watch_the_log.py DIR
+
+Each drift is printed with the plan that answered it.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+from adapters.cli.sentences import sentence
+from adapters.stores import Store
+from knowledge import from_json
+
+REQUEST, PLAN = 2, 3  # stages of a pass; 0 is the Observation, 1 the Symptom
+
+if len(sys.argv) != 2:
+    sys.exit(__doc__)
+with Store(Path(sys.argv[1], "log.sqlite"), readonly=True) as store:
+    config = store.facts()["config"]
+    due = dict.fromkeys(range(config["trials"] * config["loops"]), 1)  # loop -> pass of its next plan
+    while min(due.values()) <= config["episodes"]:
+        for loop in due:
+            for number, _, plan in store.since(loop, {PLAN: due[loop]}, limit=512):
+                due[loop] = number + 1
+                request = from_json(store.body(loop, number, REQUEST))
+                if request.drifts:
+                    print(f"loop {loop}, pass {number}", sentence(request), sentence(from_json(plan)), sep="\n  ")
+        time.sleep(0.1)
