@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from typing import cast
 
@@ -32,10 +33,10 @@ class RemoteLog:
         self.loop = loop
         self.passes = 0
         self._member = member
-        self._window: tuple[int, tuple[Pass, ...]] = (0, ())
+        self._window: tuple[int, deque[Pass]] = (0, deque())
 
     @property
-    def window(self) -> tuple[Pass, ...]:
+    def window(self) -> deque[Pass]:
         """The newest finished passes, oldest first; without those that a free-running loop had to drop."""
         if self._window[0] != self.passes:
             first = max(1, self.passes - WINDOW + 1)
@@ -46,7 +47,7 @@ class RemoteLog:
                     break
                 passes.setdefault(record.pass_no, []).append(record)
             known += [Pass(*four) for four in passes.values() if len(four) == len(STAGES)]  # type: ignore[arg-type]
-            self._window = (self.passes, tuple(known))
+            self._window = (self.passes, deque(known))
         return self._window[1]
 
     def find(self, kind: type[Record], number: int) -> Record | None:

@@ -139,7 +139,10 @@ def test_declared_publishers_and_queriers_know_whether_they_are_heard(everybody)
     """What is told of others' declarations is enough: Zenoh sends nothing for which it knows of no taker."""
     for role in STAGES:
         session = everybody.sessions[role]
-        with session.declare_publisher(f"mape/s/knowledge/beat/{role}") as beat, session.declare_querier(STATUS) as querier:
+        with (
+            session.declare_publisher(f"mape/s/knowledge/beat/{role}") as beat,
+            session.declare_querier(STATUS) as querier,
+        ):
             eventually(lambda beat=beat: beat.matching_status.matching)
             eventually(lambda querier=querier: querier.matching_status.matching)
             before = len(everybody.heard)

@@ -1,0 +1,46 @@
+"""`mapek` with one part of the recovery cut out, in all processes of a run: `no_recovery.py WHAT up CONFIG ...`.
+
+It shows that the tests under blows would notice.
+"""
+
+import sys
+
+import adapters.cli.up
+from adapters.buses import member
+from adapters.cli.main import main
+from adapters.processes import role, supervise
+
+
+def no_state(self, unit):
+    """Go on where the log ends, with a component that knows nothing of what was before."""
+    last = self.member.joined.last[unit.loop]
+    if last[3] < 0:
+        self.start(unit)
+    self.member.watch(unit.loop, max(self.first, last[3] + (self.first == 1)))
+
+
+def no_catching_up(fetch):
+    def of_the_first_start_only(self, loop):
+        if self.joined.epoch == 1:
+            fetch(self, loop)
+
+    return of_the_first_start_only
+
+
+CUTS = {
+    "state": lambda: setattr(role.Role, "_restore", no_state),
+    "catching-up": lambda: setattr(member.Member, "_fetch", no_catching_up(member.Member._fetch)),
+    "sending-again": lambda: setattr(member.Member, "_send_again", lambda self, loop: None),
+}
+
+
+def command_of(role, config, *options):
+    command = supervise.command_of(role, config, *options)
+    return [command[0], __file__, what, *command[3:]]
+
+
+if __name__ == "__main__":
+    what = sys.argv.pop(1)
+    adapters.cli.up.command_of = command_of
+    CUTS[what]()
+    sys.exit(main())

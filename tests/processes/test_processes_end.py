@@ -1,0 +1,126 @@
+"""Ctrl-C, SIGTERM and kill -9: who is to end ends at once, nobody stays behind, and the run can be gone on with."""
+
+import json
+import signal
+import sys
+import time
+from contextlib import ExitStack
+
+import pytest
+from real_processes import EXAMPLES, ROLES, alone, endpoint, five, hashes, passes, until, up, write_config
+from real_runs import run, wait_until_gone
+
+from mape import load
+
+AT_ONCE = 2.0
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
+SIGNALS = pytest.mark.parametrize("number", CODES)
+
+
+def gridworld(here, episodes):
+    config = load(
+        EXAMPLES / "gridworld_goals.toml", overrides=[f"episodes={episodes}", "system.options.switch_at=[101]"]
+    )
+    return write_config(here, json.loads(config.to_json()))
+
+
+@SIGNALS
+def test_up_ends_at_once_with_all_its_children_and_is_gone_on_with(here, number):
+    config = gridworld(here, 400)
+    with up(config) as running:
+        running.wait_for_pass(50)
+        children = running.children()
+        assert set(children) == set(ROLES)
+        code, took = running.process.signalled(number)
+        wait_until_gone(set(children.values()))
+        assert (code, took < AT_ONCE) == (CODES[number], True), f"exit code {code} after {took:.2f} s"
+        assert "mapek resume up" in running.process.said.replace(f"{here}/", "")
+        assert 50 <= running.passes() < 400
+    if number == signal.SIGINT:
+        with up(config) as again:
+            again.result()
+    else:
+        run("resume", "up", "-q", cwd=here)
+    assert hashes(json.loads((here / "up" / "result.json").read_bytes())) == alone(config)
+
+
+def test_children_end_by_themselves_when_up_is_killed(here):
+    config = gridworld(here, 100_000)
+    with up(config) as running:
+        running.wait_for_pass(50)
+        children = set(running.children().values())
+        running.process.signalled(signal.SIGKILL)
+        begun = time.monotonic()
+        wait_until_gone(children)
+        assert time.monotonic() - begun < AT_ONCE
+    assert "Traceback" not in "".join(running.said_by(role) for role in ROLES)
+
+
+def test_a_signal_while_the_figures_are_drawn_is_heard_too(here):
+    config = gridworld(here, 60)
+    with up(config, short=("-q",)) as running:
+        until(lambda: (running.out / "episodes-gridworld_goals.npz").exists(), "the tables", every=0.001)
+        code, took = running.process.signalled(signal.SIGTERM)
+    assert (code, took < AT_ONCE) == (143, True), running.process.said
+    assert "Traceback" not in running.process.said
+    assert "mapek resume" in running.process.said
+
+
+def test_every_served_role_ends_at_once(here):
+    config = gridworld(here, 100_000)
+    ended = {}
+    with ExitStack() as opened:
+        sets = {
+            number: opened.enter_context(five(config, endpoint(here, number.name), out=number.name)) for number in CODES
+        }
+        for number, served in sets.items():
+            until(lambda name=number.name: passes(here / name / "log.sqlite") > 20, "a run that is on its way")
+            # Knowledge last: the others then leave a run that goes on, or at least waits.
+            for role in (*ROLES[1:], "knowledge"):
+                ended[number.name, role] = served[role].signalled(number)
+                assert "Traceback" not in served[role].said
+    assert {key: code for key, (code, _) in ended.items()} == {
+        (number.name, role): code for number, code in CODES.items() for role in ROLES
+    }
+    print({key: round(took, 2) for key, (_, took) in ended.items()})
+    slow = {key: round(took, 2) for key, (_, took) in ended.items() if took >= AT_ONCE}
+    assert slow == {}
+
+
+def test_a_role_that_waits_for_knowledge_ends_at_once(here):
+    config = gridworld(here, 100)
+    with five(config, endpoint(here), order=ROLES[1:]) as served:
+        for role, process in served.items():
+            until(lambda p=process: "waiting for Knowledge" in p.said, f"{role} to say for whom it waits")
+            code, took = process.signalled(signal.SIGTERM)
+            assert (code, took < AT_ONCE) == (143, True), f"{role}: exit code {code} after {took:.2f} s"
+
+
+IN_A_FINALISER = """
+import os, signal, threading
+from adapters.processes.serve import Terminated, terminated_by_signal
+
+
+class Finalised:
+    def __del__(self):
+        os.kill(os.getpid(), number)
+
+
+def heard(number):
+    try:
+        with terminated_by_signal():
+            Finalised()
+            threading.Event().wait(60.0)
+    except (Terminated, KeyboardInterrupt) as stop:
+        return type(stop).__name__
+
+
+for number in (signal.SIGTERM, signal.SIGINT):
+    print(heard(number))
+"""
+
+
+def test_a_signal_that_meets_a_finaliser_is_not_lost(here):
+    """What is raised within one comes out nowhere, and figures or tables leave many behind."""
+    ended = run("-c", IN_A_FINALISER, cwd=here, start=(sys.executable,))
+    assert (ended.stdout.split(), ended.stderr) == (["Terminated", "KeyboardInterrupt"], "")
