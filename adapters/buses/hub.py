@@ -130,7 +130,7 @@ class KnowledgeHub:
         self.wire = wire
         self.failure: ResultsError | None = None
         self.ended = threading.Event()  # the run is complete, or the worker has failed
-        self.left = threading.Event()  # the run is complete, and no role is there any more
+        self.left = threading.Event()  # the run is complete, and all roles have come and gone
         self._config = config
         self._versions = dict(versions or {})
         self._snapshot_every = snapshot_every
@@ -142,7 +142,7 @@ class KnowledgeHub:
             ledger.commit()
         self._asked: SimpleQueue[tuple[str, Any] | None] = SimpleQueue()
         self._seen = {role: _Seen() for role in ROLES}
-        self._came = False  # whether any role was here since this Knowledge listens
+        self._came: set[str] = set()  # roles that were here since this Knowledge listens
         self._leave: Callable[..., object] | None = None
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
@@ -230,7 +230,7 @@ class KnowledgeHub:
                 self._say(answer)
             if self.ledger.complete:
                 self.ended.set()
-                if self._came and not any(seen.tokens for seen in self._seen.values()):
+                if self._came.issuperset(ROLES) and not any(seen.tokens for seen in self._seen.values()):
                     self.left.set()
             if asked == ("", None):
                 asked = self._asked.get()
@@ -521,7 +521,7 @@ class KnowledgeHub:
             return
         if sample.kind == zenoh.SampleKind.PUT:
             self._seen[role].tokens.add(int(epoch))
-            self._came = True
+            self._came.add(role)
         else:
             self._seen[role].tokens.discard(int(epoch))
 

@@ -255,7 +255,15 @@ def _check_endpoint(endpoint: str, anywhere: bool) -> None:
         )
 
 
+_POOLS = ("rx", "tx", "net", "acc")
+_ONE_RUNTIME = f"({', '.join(f'{pool}: (handover: app)' for pool in _POOLS)}, app: (worker_threads: 2))"
+    f"({', '.join(f'{pool}: (handover: app)' for pool in ('rx', 'tx', 'net', 'acc'))}, app: (worker_threads: 2))"
+)
+"""By default Zenoh hands each message from one pool of threads to the next; these wake-ups cost more than all else."""
+
+
 def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:
+    os.environ.setdefault("ZENOH_RUNTIME", _ONE_RUNTIME)  # read once, when the first session of a process is opened
     # Zenoh says nowhere else that it has closed a link.
     zenoh.init_log_from_env_or("error")
     try:

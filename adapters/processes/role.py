@@ -208,7 +208,7 @@ def plain(state: Any) -> Any:
         place in a key.
     """
     try:
-        same = json.loads(json.dumps(state, allow_nan=False))
+        same = json.loads(json.dumps(state, allow_nan=False, ensure_ascii=False).encode())
     except (TypeError, ValueError) as error:
         raise PartError(f"the state {state!r} is not plain JSON: {error}") from error
     if not _alike(state, same):

@@ -77,6 +77,8 @@ class Child:
 
     def start(self) -> None:
         """Start it, in a session of its own, so that Ctrl-C reaches the supervisor alone."""
+        if self.process is not None and self.process.stdin is not None:
+            self.process.stdin.close()
         with open(self.log, "ab") as log:
             self.process = subprocess.Popen(
                 self.command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True

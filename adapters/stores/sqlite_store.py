@@ -356,10 +356,13 @@ class Store:
     # What happened beside the records.
 
     def keep_swap(self, swap: Swap) -> None:
-        """Write that a part was replaced."""
+        """Write that a part was replaced; what was planned for that pass does not take the place of what was asked for."""
         loop, number, part, spec, handed_over, planned = swap
+        # Who does a pass again first tells again of the part that was planned, and not of the one that followed it.
         self._write(
-            "INSERT OR REPLACE INTO swaps VALUES (?, ?, ?, ?, ?, ?)",
+            "INSERT INTO swaps VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (loop, pass, part) DO UPDATE SET "
+            "spec = excluded.spec, handed_over = excluded.handed_over, planned = excluded.planned "
+            "WHERE planned OR NOT excluded.planned",
             loop, number, part, json.dumps(spec), handed_over, planned,
         )  # fmt: skip
 

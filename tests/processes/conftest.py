@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-for _folder in (Path(__file__).parent, Path(__file__).parents[1] / "results"):
+for _folder in (Path(__file__).parent, *(Path(__file__).parents[1] / name for name in ("buses", "results"))):
     sys.path.append(str(_folder))
 
 # With --doctest-modules pytest would import it a second time, under the name of another folder's.

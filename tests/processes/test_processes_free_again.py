@@ -1,0 +1,109 @@
+"""A free-running Execute that restarts behind gaps and outages, or is driven faster than the loop can follow."""
+
+import json
+from itertools import pairwise
+
+import pytest
+from real_processes import rows, store, up, write_config
+from roles_on_threads import Paced, Roles, paced
+
+from knowledge import from_json
+from mape.execute import Execute
+
+pytestmark = pytest.mark.timeout(90)
+
+OTHERS = ("monitor", "analyze", "plan")
+
+
+def free(episodes, rate=200.0, backlog=2000):
+    # The compiled episode takes no time to speak of, so that the rate is kept.
+    execute = {"mode": "free", "rate": rate, "backlog": backlog, "engine": "auto"}
+    return paced(episodes, {"execute": execute, "system": {"options": {"switch_at": [31]}}})
+
+
+def observations(log):
+    return [from_json(body) for (body,) in rows(log, "SELECT body FROM records WHERE stage = 0 ORDER BY pass")]
+
+
+def dropped(log):
+    with store(log) as opened:
+        return opened.dropped(0)
+
+
+def refused(log):
+    return [text for (text,) in rows(log, "SELECT text FROM events WHERE kind = 'refused'")]
+
+
+@pytest.fixture
+def adopted(monkeypatch):
+    """List the passes of the plans that any Execute puts in force."""
+    passes, true_adopt = [], Execute.adopt
+
+    def adopt(self, plan):
+        passes.append(plan.pass_no)
+        return true_adopt(self, plan)
+
+    monkeypatch.setattr(Execute, "adopt", adopt)
+    return passes
+
+
+def test_execute_restarts_across_a_gap_of_dropped_episodes_that_have_no_plans(here, adopted):
+    with Roles(free(500, backlog=40), here) as run:
+        Paced.free.set()
+        run.start_all()
+        run.wait_for_pass(40)
+        run.close()
+        run.until(lambda: run.roles["execute"].units[0].dropped, "more episodes than are held back")
+        run.open()
+        first, final = run.until(lambda: dropped(run.path), "a gap")[0]
+        run.wait_for_pass(final + 20)
+        run.end("execute")
+        adopted.clear()
+        run.start("execute")
+        run.join()
+        assert run.last == (500,) * 4
+    # Its state is that after the gap, under a plan from before it. What was dropped was planned by nobody.
+    missing = {number for a, b in dropped(run.path) for number in range(a, b + 1)}
+    assert 40 < adopted[0] <= final + 1
+    assert adopted == [number for number in range(adopted[0], 501) if number not in missing]
+    assert refused(run.path) == []
+
+
+def test_a_restarted_execute_puts_the_plans_in_force_that_came_while_it_was_behind_with_them(here, adopted):
+    with Roles(free(400), here, snapshot_every=20) as run:
+        Paced.free.set()
+        run.start_all()
+        run.wait_for_pass(40)
+        for role in OTHERS:
+            run.end(role)
+        stuck, driven = run.last[3], run.last[0]
+        run.until(lambda: run.last[0] >= driven + 100, "episodes without plans")
+        run.end("execute")
+        with store(run.path) as log:
+            assert log.snapshot(0, "execute").pass_no > stuck + 50  # a state that is far ahead of its plan
+        adopted.clear()
+        run.start("execute")
+        back = run.last[0]
+        run.until(lambda: run.last[0] > back + 10, "episodes after the restart")
+        for role in OTHERS:
+            run.start(role)
+        run.join()
+        assert run.last == (400,) * 4
+    assert adopted == [*range(stuck + 1, 401)]
+    seen = observations(run.path)
+    assert [one.pass_no for one in seen] == [*range(1, 401)]
+    assert refused(run.path) == []
+
+
+def test_behind_a_rate_that_cannot_be_reached_plans_and_acknowledgements_are_heard(here):
+    """In processes: on threads Execute would keep the others from their work."""
+    backlog, total = 200, 6000
+    config = write_config(here, json.loads(free(total, rate=1e5, backlog=backlog).to_json()) | {"analyze": "changes"})
+    with up(config) as running:
+        running.result()
+    seen, gaps = observations(running.log), dropped(running.log)
+    print(f"{len(seen)} episodes in the log, {len(gaps)} gaps {gaps[:9]}, ages {[one.age for one in seen[::200]]}")
+    assert len(seen) + sum(final - first + 1 for first, final in gaps) == total
+    # Once full, the backlog is half empty before it takes again: gaps are few, and not one for each place.
+    between = [after - final - 1 for (_, final), (after, _) in pairwise(gaps)]
+    assert all(taken >= backlog // 2 for taken in between)

@@ -1,0 +1,137 @@
+"""Who is silent for too long is killed and started again, so often and no more; and the run then says why it ends."""
+
+import os
+import re
+import signal
+import sys
+
+import pytest
+from bus_peers import Site, join_of
+from real_processes import EXAMPLES, events, up, write_config
+
+from adapters.buses import Wire
+from adapters.buses.messages import Beat, Joined
+from adapters.buses.wire import ORDERED, ROLES
+from adapters.processes import supervise
+from adapters.processes.supervise import Failed, Supervisor
+
+pytestmark = pytest.mark.timeout(60)
+
+SLEEPS = [sys.executable, "-S", "-c", "import time; time.sleep(100)"]
+"""A process that says nothing: what roles say, the test says in their name."""
+
+
+class Enough(Exception):
+    """The test has seen what it wanted."""
+
+
+class Watched:
+    """A supervisor of five processes that do nothing, over a Knowledge in this process."""
+
+    def __init__(self, folder, monkeypatch, *, hang_after):
+        for name, value in (("LOOK_EVERY", 0.01), ("STATUS_EVERY", 0.02), ("CRASHES", 3)):
+            monkeypatch.setattr(supervise, name, value)
+        self.wire = Wire(f"unixsock-stream/{folder}/k.sock", "example")
+        self.told = []
+        self.speaking = set(ROLES)
+        self.joining = set(ROLES)
+        self._pids, self._epochs = {}, {}
+        commands = dict.fromkeys(("knowledge", *ROLES), SLEEPS)
+        self.supervisor = Supervisor(self.wire, commands, folder, hang_after=hang_after, tell=self.told.append)
+
+    def watch(self, enough=lambda watched: False):
+        """Watch until it is enough, or the supervisor has given up."""
+        with Site(self.wire) as site, self.supervisor:
+            self.raw = site.session()
+
+            def look(supervisor):
+                for role in ROLES:
+                    self._speak(role, supervisor.children[role].pid)
+                if enough(self):
+                    raise Enough
+
+            self.supervisor.watch(look)
+
+    def _speak(self, role, pid):
+        if role in self.joining and self._pids.get(role) != pid:
+            (answer,) = self.raw.get(self.wire.ask(f"join/{role}"), payload=join_of(role, pid=pid), timeout=5)
+            self._epochs[role] = Joined.unpack(answer.ok.payload.to_bytes())[0].epoch
+            self._pids[role] = pid
+        if role in self.speaking:
+            beat = Beat(epoch=self._epochs[role], pid=pid, passes=0, refused=0, waiting=True)
+            self.raw.put(self.wire.beat(role), beat.pack(), **ORDERED)
+
+    @property
+    def restarts(self):
+        return {role: child.restarts for role, child in self.supervisor.children.items() if child.restarts}
+
+
+def test_who_is_silent_again_and_again_ends_the_run_with_a_sentence_that_names_the_way_out(here, monkeypatch):
+    watched = Watched(here, monkeypatch, hang_after=0.3)
+    watched.speaking.remove("plan")
+    with pytest.raises(Failed, match=r"plan died 3 times .*silent for 0\.3 s; .* give a longer --hang-after"):
+        watched.watch()
+    assert watched.restarts == {"plan": 2}
+    pids = [re.fullmatch(r"plan \(process (\d+)\) was silent for 0\.\d s; it is killed and started again", sentence)[1]
+            for sentence in watched.told]  # fmt: skip
+    assert len({*pids}) == len(pids) == 3
+
+
+def test_who_hangs_before_it_joins_is_hung_once_it_has_had_the_time_of_a_start(here, monkeypatch):
+    monkeypatch.setattr(supervise, "STARTS_WITHIN", 1.0)
+    watched = Watched(here, monkeypatch, hang_after=0.3)
+    watched.joining.remove("plan")
+    watched.speaking.remove("plan")
+    with pytest.raises(Enough):
+        watched.watch(lambda watched: watched.restarts)
+    assert watched.restarts == {"plan": 1}
+    (sentence,) = watched.told
+    assert re.match(r"plan \(process \d+\) was silent for 1\.\d s;", sentence)
+
+
+def test_who_speaks_is_not_hung(here, monkeypatch):
+    """However long ago it was started."""
+    monkeypatch.setattr(supervise, "STARTS_WITHIN", 0.2)
+    watched = Watched(here, monkeypatch, hang_after=0.5)
+    looks = []
+    with pytest.raises(Enough):
+        watched.watch(lambda watched: looks.append(1) or len(looks) > 100)
+    assert (watched.restarts, watched.told) == ({}, [])
+
+
+def test_who_dies_otherwise_is_not_told_of_hanging(here, monkeypatch):
+    watched = Watched(here, monkeypatch, hang_after=50.0)
+
+    def kill(watched):
+        os.kill(watched.supervisor.children["plan"].pid, signal.SIGKILL)
+
+    with pytest.raises(Failed, match=r"plan died 3 times .*\(exit code -9\)"):
+        watched.watch(kill)
+    assert watched.told == []
+
+
+OWN = """
+import time
+from mape.plan.morphin import Morphin
+
+
+class Sleeps(Morphin):
+    def plan(self, request, knowledge):
+        if request.pass_no == 5:
+            time.sleep(100)
+        return super().plan(request, knowledge)
+"""
+
+
+@pytest.mark.long
+def test_a_pass_that_is_longer_than_may_be_ends_a_real_run_with_that_sentence(here):
+    (here / "own_parts.py").write_text(OWN)
+    table = {"name": "grid", "episodes": 20, "extends": str(EXAMPLES / "gridworld_goals.toml")}
+    config = write_config(here, table | {"system": {"options": {"switch_at": [11]}}})
+    options = ("--hang-after", "1", "--set", "plan.name=own_parts:Sleeps")
+    with up(config, *options, short=("--no-figures",)) as running:
+        said = running.process.end(1, 60.0)
+    assert "give a longer --hang-after" in said
+    assert said.count("it is killed and started again") == supervise.CRASHES
+    joins = [event for event in events(running.log, "joined") if event.role == "plan"]
+    assert len(joins) == supervise.CRASHES
