@@ -256,9 +256,8 @@ def _check_endpoint(endpoint: str, anywhere: bool) -> None:
 
 
 _POOLS = ("rx", "tx", "net", "acc")
-_ONE_RUNTIME = f"({', '.join(f'{pool}: (handover: app)' for pool in _POOLS)}, app: (worker_threads: 2))"
-    f"({', '.join(f'{pool}: (handover: app)' for pool in ('rx', 'tx', 'net', 'acc'))}, app: (worker_threads: 2))"
-)
+_HANDED_OVER = ", ".join(f"{pool}: (handover: app)" for pool in _POOLS)
+_ONE_RUNTIME = f"({_HANDED_OVER}, app: (worker_threads: 2))"
 """By default Zenoh hands each message from one pool of threads to the next; these wake-ups cost more than all else."""
 
 

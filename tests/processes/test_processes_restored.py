@@ -1,6 +1,5 @@
 """What is there again after a restart: of a planner, of a part with an odd state, of Knowledge, of a first episode."""
 
-import json
 import sys
 import threading
 import time

@@ -104,7 +104,7 @@ def test_the_operator_and_knowledge_may_ask_all_roles_at_once(everybody, key):
 # Who may send what.
 
 STREAMS = [f"mape/s/0/{role}" for role in sorted(STAGES)]
-BEATS = {f"mape/s/knowledge/beat/{role}": {role} for role in STAGES}
+BEATS = {f"mape/s/knowledge/beat/{role}": {role} for role in sorted(STAGES)}
 PUTS = {
     **dict.fromkeys(STREAMS, NOBODY),
     **BEATS,
