@@ -356,7 +356,7 @@ class Store:
     # What happened beside the records.
 
     def keep_swap(self, swap: Swap) -> None:
-        """Write that a part was replaced; what was planned for that pass does not take the place of what was asked for."""
+        """Write that a part was replaced; what was planned does not take the place of what was asked for."""
         loop, number, part, spec, handed_over, planned = swap
         # Who does a pass again first tells again of the part that was planned, and not of the one that followed it.
         self._write(

@@ -55,7 +55,7 @@ def test_execute_restarts_across_a_gap_of_dropped_episodes_that_have_no_plans(he
         run.close()
         run.until(lambda: run.roles["execute"].units[0].dropped, "more episodes than are held back")
         run.open()
-        first, final = run.until(lambda: dropped(run.path), "a gap")[0]
+        _, final = run.until(lambda: dropped(run.path), "a gap")[0]
         run.wait_for_pass(final + 20)
         run.end("execute")
         adopted.clear()

@@ -141,7 +141,7 @@ def test_of_a_planned_and_a_live_swap_at_one_pass_the_planned_one_is_first_whoev
         digest = run.hash()
     with store(run.path) as log:
         assert [(s.pass_no, s.spec, s.planned) for s in log.swaps()] == [(20, {"name": "q_learning"}, False)]
-    # For the next start, and for a replay. The learner that was asked for is the one that there was before the planned one.
+    # For the next start, and for a replay. Asked for was the learner that there was before the planned one.
     assert digest == alone(paced(40, planned | {"swap": []})) != alone(paced(40, planned))
 
 
