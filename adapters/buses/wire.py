@@ -255,14 +255,16 @@ def _check_endpoint(endpoint: str, anywhere: bool) -> None:
         )
 
 
-_POOLS = ("rx", "tx", "net", "acc")
-_HANDED_OVER = ", ".join(f"{pool}: (handover: app)" for pool in _POOLS)
-_ONE_RUNTIME = f"({_HANDED_OVER}, app: (worker_threads: 2))"
-"""By default Zenoh hands each message from one pool of threads to the next; these wake-ups cost more than all else."""
+_RUNTIME = "(net: (handover: app), acc: (handover: app), app: (worker_threads: 1))"
+"""Zenoh hands each message from one pool of threads to the next, and these wake-ups cost more than all else.
+
+What reads and what writes the links keeps its own threads: one that writes much and waits must not keep another from
+reading it.
+"""
 
 
 def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:
-    os.environ.setdefault("ZENOH_RUNTIME", _ONE_RUNTIME)  # read once, when the first session of a process is opened
+    os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read once, when the first session of a process is opened
     # Zenoh says nowhere else that it has closed a link.
     zenoh.init_log_from_env_or("error")
     try:

@@ -1,0 +1,45 @@
+"""A role that takes longer for what it is given than Knowledge for giving it."""
+
+import threading
+
+import pytest
+from bus_peers import Site
+from bus_records import run_of
+
+from adapters.buses import hub, member
+from adapters.buses.wire import INPUT
+from knowledge import STAGES, to_json
+
+pytestmark = pytest.mark.timeout(60)
+
+
+def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):
+    passes, limit = 512, 64
+    for module in (hub, member):
+        monkeypatch.setattr(module, "SINCE_LIMIT", limit)
+    # One answer takes it longer than it waits for an answer, and longer than silence lasts.
+    monkeypatch.setattr(member, "ANSWER_WITHIN", 0.05)
+    monkeypatch.setattr(member, "SILENCE", 0.02)
+    asked, true_since = [], hub.KnowledgeHub._since
+
+    def since(self, query):
+        asked.append(int(query.parameters.get("from").partition(":")[2]))
+        return true_since(self, query)
+
+    monkeypatch.setattr(hub.KnowledgeHub, "_since", since)
+    with Site(wire, begun=True) as site:
+        for record in run_of(passes):
+            site.ledger.take(0, STAGES.index(type(record)), to_json(record))
+        site.ledger.commit()
+        monitor, got, pause = site.member("monitor"), [], threading.Event()
+        monitor.watch(0, 1)
+        while len(got) < passes:
+            came = monitor.receive(1.0)
+            if came is not None:
+                got.append(came)
+                pause.wait(0.002)
+    assert got == [record for record in run_of(passes) if type(record) is INPUT["monitor"]]
+    # What it asks when it has all is whether there is more; that has its own pace.
+    questions = [number for number in asked if number <= passes]
+    print(f"asked {len(questions)} times for {passes // limit} full answers: {questions}")
+    assert len(questions) <= 2 * (passes // limit)
