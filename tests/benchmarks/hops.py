@@ -104,10 +104,13 @@ class OverRedis:
         self.redis.publish(f"append:{loop}:{role}", PAYLOAD)
 
     def receive(self):
+        deadline = time.monotonic() + PATIENCE
         while True:
             message = self.came.get_message(timeout=PATIENCE)
-            if message is None:
-                sys.exit(LOST)
+            if message is None:  # a confirmation that is ignored comes as nothing, too
+                if time.monotonic() > deadline:
+                    sys.exit(LOST)
+                continue
             if message["channel"].startswith(b"stream"):
                 return int(message["channel"].split(b":")[1])
 
