@@ -48,7 +48,7 @@ def adopted(monkeypatch):
 
 
 def test_execute_restarts_across_a_gap_of_dropped_episodes_that_have_no_plans(here, adopted):
-    with Roles(free(500, backlog=40), here) as run:
+    with Roles(free(800, backlog=40), here) as run:
         Paced.free.set()
         run.start_all()
         run.wait_for_pass(40)
@@ -56,16 +56,16 @@ def test_execute_restarts_across_a_gap_of_dropped_episodes_that_have_no_plans(he
         run.until(lambda: run.roles["execute"].units[0].dropped, "more episodes than are held back")
         run.open()
         _, final = run.until(lambda: dropped(run.path), "a gap")[0]
-        run.wait_for_pass(final + 20)
+        run.until(lambda: observations(run.path)[-1].plan > final, "an episode under a plan from after it")
         run.end("execute")
         adopted.clear()
         run.start("execute")
         run.join()
-        assert run.last == (500,) * 4
+        assert run.last == (800,) * 4
     # Its state is that after the gap, under a plan from before it. What was dropped was planned by nobody.
     missing = {number for a, b in dropped(run.path) for number in range(a, b + 1)}
     assert 40 < adopted[0] <= final + 1
-    assert adopted == [number for number in range(adopted[0], 501) if number not in missing]
+    assert adopted == [number for number in range(adopted[0], 801) if number not in missing]
     assert refused(run.path) == []
 
 

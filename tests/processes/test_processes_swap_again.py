@@ -37,13 +37,19 @@ class Held(PageHinkley):
 
 
 class Late(Exponential):
-    """Keeps its contract wherever it is checked, and fails in the thread of the role."""
+    """Keeps its contract wherever it is checked, can be made, and fails in its first pass in the thread of the role."""
 
-    @property
-    def epsilon(self):
+    def advance(self, episode_return):
+        self._fail()
+        super().advance(episode_return)
+
+    def reset(self):
+        self._fail()
+        super().reset()
+
+    def _fail(self):
         if threading.current_thread().name == "plan":
             raise ZeroDivisionError("no budget left")
-        return super().epsilon
 
 
 class Waits(Morphin):
@@ -117,7 +123,7 @@ def test_after_a_schedule_that_was_refused_the_next_planner_has_the_old_one(here
         run.wait_for_pass(10)
         refused = run.ask_for("plan.schedule", {"name": "own:Late"}, "plan")()
         assert "'own:Late' was refused" in refused
-        assert "no budget left" in refused
+        assert "no budget left, at pass" in refused
         (number,) = run.ask_for("plan", to, "plan")().passes
         digest = run.hash()
     assert digest == alone(paced(60, {"swap": [swapped(number, "plan", to)]}))
