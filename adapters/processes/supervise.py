@@ -63,6 +63,7 @@ class Child:
         self.deaths: deque[tuple[float, int]] = deque(maxlen=CRASHES)
         self.errors = 0
         self.hung = 0
+        self.killed = False  # it may take a moment until it is gone
         self.done = False
 
     @property
@@ -84,6 +85,7 @@ class Child:
                 self.command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
             )
         self.starts += 1
+        self.killed = False
         self.started_at = time.monotonic()
 
     def end(self) -> None:
@@ -196,7 +198,8 @@ class Supervisor:
             return
         code = child.process.poll()
         if code is None:
-            self._is_hung(child)
+            if not child.killed:
+                self._is_hung(child)
             return
         if code == 0:
             child.done = True
@@ -239,6 +242,7 @@ class Supervisor:
                 silent = min(silent, role.beat_age or 0.0)
         if silent > (self.hang_after if spoke else max(self.hang_after, STARTS_WITHIN)):
             child.hung += 1
+            child.killed = True
             self.tell(
                 f"{child.role} (process {child.pid}) was silent for {silent:.1f} s; it is killed and started again"
             )
