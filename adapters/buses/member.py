@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from adapters.buses.hub import OF_CONFIG, SINCE_LIMIT, host
+from adapters.buses.answers import OF_CONFIG, SINCE_LIMIT
 from adapters.buses.messages import Beat, Control, Dropped, Happened, Join, Joined, Layout, State, Swapped, Table
-from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, STAGE_OF, Wire, hand_over
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, STAGE_OF, Wire, hand_over, host
 from knowledge import STAGES, MalformedRecord, QTable, Record, from_json, to_json
 from mape.errors import BusError, ConfigError
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -231,6 +232,18 @@ def system_segment(identifier: str) -> str:
 def role_of(kind: type[Record]) -> str:
     """Return the role that sends records of `kind`."""
     return ROLES[STAGES.index(kind)]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that the processes of a run compare."""
+    from adapters.results.folder import versions as of_results
+
+    return {**of_results(), "wire": str(WIRE_VERSION)}
+
+
+def host() -> str:
+    """Return this machine's name, for people."""
+    return socket.gethostname()[:255]
 
 
 def _check_endpoint(endpoint: str, anywhere: bool) -> None:

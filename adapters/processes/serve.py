@@ -14,10 +14,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from adapters.buses.hub import KnowledgeHub, versions
+from adapters.buses.hub import KnowledgeHub
 from adapters.buses.member import Member
 from adapters.buses.messages import Layout
-from adapters.buses.wire import Wire
+from adapters.buses.wire import Wire, versions
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
 from mape.config import Config

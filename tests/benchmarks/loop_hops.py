@@ -14,8 +14,7 @@ from pathlib import Path
 import hops
 
 from adapters.buses import Member, Wire
-from adapters.buses.hub import versions
-from adapters.buses.wire import system_segment
+from adapters.buses.wire import system_segment, versions
 from adapters.processes.roles import make_role
 from adapters.processes.serve import quick_switches
 from mape.config import load

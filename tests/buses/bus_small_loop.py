@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 
 from adapters.buses import KnowledgeHub, Member
-from adapters.buses.hub import versions
+from adapters.buses.wire import versions
 from adapters.processes.roles import make_role
 from adapters.processes.serve import open_ledger
 from adapters.systems import make_system

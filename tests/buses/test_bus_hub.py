@@ -10,7 +10,7 @@ import zenoh
 from bus_peers import Site, ask, eventually, join_of, status
 from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
-from adapters.buses import KnowledgeHub, Wire, hub
+from adapters.buses import KnowledgeHub, Wire, answers, hub
 from adapters.buses.messages import Beat, Dropped, Happened, Joined, State, Swapped, Table
 from adapters.buses.wire import ORDERED, STAGE_OF, WIRE_VERSION
 from knowledge import QTable, to_json
@@ -310,7 +310,7 @@ def test_the_last_episode_that_was_begun_is_told_to_who_joins(site, raw, joined)
 
 
 def test_the_records_since_a_pass_come_up_to_a_limit(site, raw, joined, monkeypatch):
-    monkeypatch.setattr(hub, "SINCE_LIMIT", 3)
+    monkeypatch.setattr(answers, "SINCE_LIMIT", 3)
     for record in run_of(2):
         role = ("execute", "monitor", "analyze", "plan")[[type(r) for r in run_of(1)[1:]].index(type(record))]
         append(raw, site.wire, role, to_json(record))
@@ -419,14 +419,14 @@ def test_a_malformed_message_is_refused_in_words_that_can_be_told(site, raw, joi
 def test_knowledge_outlives_one_that_asks_and_is_gone_before_the_reply(site, raw, joined, monkeypatch):
     """The question waits until who asked has left."""
     held, go = threading.Event(), threading.Event()
-    true_status = site.hub.status
+    true_status = site.hub.presence.status
 
     def slow_status():
         held.set()
         assert go.wait(10)
         return true_status()
 
-    monkeypatch.setattr(site.hub, "status", slow_status)
+    monkeypatch.setattr(site.hub.presence, "status", slow_status)
     with site.wire.join("operator", 5) as gone:
         gone.get(site.wire.ask("status"), lambda reply: None)
         assert held.wait(10)

@@ -6,7 +6,7 @@ import pytest
 from bus_peers import Site, ask, eventually, play_part, received, serve_questions, status
 from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
-from adapters.buses import Member, hub, member
+from adapters.buses import Member, answers, hub, member
 from adapters.buses.member import Asked, Refused
 from adapters.buses.messages import Control, State, Swapped, Table
 from adapters.buses.wire import INPUT, ORDERED, ROLES
@@ -90,7 +90,7 @@ def test_a_record_is_sent_on_without_waiting_for_the_one_before(site, all_four):
 
 @pytest.mark.parametrize("limit", [1, 2, 512])
 def test_who_joins_late_gets_all_from_where_it_asks_for_it(site, monkeypatch, limit):
-    for module in (hub, member):
+    for module in (answers, member):
         monkeypatch.setattr(module, "SINCE_LIMIT", limit)
     site.everybody()
     site.send(*run_of(5))
@@ -157,7 +157,7 @@ def impatient(monkeypatch):
 
 def lose(monkeypatch, site, wanted):
     """Let Knowledge not hear what `wanted` names, once each."""
-    lost, true_append = [], site.hub._append
+    lost, true_append = [], site.hub.answers.append
 
     def append(query):
         data = query.payload.to_bytes()
@@ -167,7 +167,7 @@ def lose(monkeypatch, site, wanted):
             return None
         return true_append(query)
 
-    monkeypatch.setattr(site.hub, "_append", append)
+    monkeypatch.setattr(site.hub.answers, "append", append)
     return lost
 
 

@@ -6,7 +6,7 @@ import pytest
 from bus_peers import Site
 from bus_records import run_of
 
-from adapters.buses import hub, member
+from adapters.buses import answers, member
 from adapters.buses.wire import INPUT
 from knowledge import STAGES, to_json
 
@@ -15,18 +15,18 @@ pytestmark = pytest.mark.timeout(60)
 
 def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):
     passes, limit = 512, 64
-    for module in (hub, member):
+    for module in (answers, member):
         monkeypatch.setattr(module, "SINCE_LIMIT", limit)
     # One answer takes it longer than it waits for an answer, and longer than silence lasts.
     monkeypatch.setattr(member, "ANSWER_WITHIN", 0.05)
     monkeypatch.setattr(member, "SILENCE", 0.02)
-    asked, true_since = [], hub.KnowledgeHub._since
+    asked, true_since = [], answers.Answers._since
 
     def since(self, query):
         asked.append(int(query.parameters.get("from").partition(":")[2]))
         return true_since(self, query)
 
-    monkeypatch.setattr(hub.KnowledgeHub, "_since", since)
+    monkeypatch.setattr(answers.Answers, "_since", since)
     with Site(wire, begun=True) as site:
         for record in run_of(passes):
             site.ledger.take(0, STAGES.index(type(record)), to_json(record))

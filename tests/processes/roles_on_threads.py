@@ -51,7 +51,7 @@ class Roles(Distributed):
 
     def open(self):
         super().open()
-        self.hub._snapshot_every = self.snapshot_every
+        self.hub.answers.snapshot_every = self.snapshot_every
 
     def __enter__(self):
         Paced.free.clear()

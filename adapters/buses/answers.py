@@ -1,0 +1,316 @@
+"""What Knowledge says to what is sent and asked: taken, given, or refused with a reason."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import zenoh
+
+from adapters.buses.messages import (
+    Acknowledged,
+    Dropped,
+    Happened,
+    Join,
+    Joined,
+    Layout,
+    State,
+    Swapped,
+    Table,
+)
+from adapters.buses.presence import Presence
+from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, ROLES, STAGE_OF
+from adapters.stores.ledger import Ledger
+from adapters.stores.sqlite_store import Snapshot, Swap
+from knowledge import STAGES, Ack, MalformedRecord
+from mape.errors import BusError
+from mape.parts import owner
+from mape.tables import first_difference
+
+SINCE_LIMIT = 512
+"""Most records in one answer to `since`; a shorter answer reaches the end of the log."""
+
+OF_CONFIG = "config: "
+"""What a refusal begins with that is a matter of the config."""
+
+TOLD_BY_ROLES = ("begun", "aborted", "swap refused")
+"""Kinds of events that a role may tell; the others are Knowledge's own word."""
+
+
+class Answer(NamedTuple):
+    """What is said once all that was taken is on disk: the reply, and what is published before it.
+
+    `published` is role, loop and record.
+    """
+
+    query: zenoh.Query
+    payload: bytes
+    published: tuple[str, int, bytes] | None = None
+
+
+class Refusal(BusError):
+    """An answer that says no, and why; nothing was changed."""
+
+
+class Answers:
+    """Answers one question at a time; what it takes is written by the ledger's next commit.
+
+    Parameters
+    ----------
+    ledger, presence
+        The logs, and who is there.
+    config, versions, snapshot_every
+        As `KnowledgeHub` takes them.
+    seal
+        What Knowledge attaches to all that it publishes; told to who joins.
+    fetch_table
+        Asks Execute, in its own time, for the Q-table of a loop's episode, and has the question answered then.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        presence: Presence,
+        *,
+        config: Mapping[str, Any] | None,
+        versions: Mapping[str, str],
+        snapshot_every: int,
+        seal: str,
+        fetch_table: Callable[[zenoh.Query, int, int], object],
+    ) -> None:
+        self.snapshot_every = snapshot_every
+        self._ledger = ledger
+        self._presence = presence
+        self._config = config
+        self._versions = versions
+        self._seal = seal
+        self._fetch_table = fetch_table
+
+    # What roles send.
+
+    def append(self, query: zenoh.Query) -> Answer:
+        """Take a record, or what a free-running loop dropped.
+
+        Raises
+        ------
+        ValueError, MapekError
+            It is not taken, and why. Nothing was changed.
+        """
+        parts = str(query.key_expr).split("/")
+        if len(parts) != 5:
+            raise Refusal(f"no records are taken under {query.key_expr}")
+        loop, role = _whole(parts[2], "the loop"), parts[4]
+        if role not in STAGE_OF:
+            raise Refusal(f"role {role!r} sends no records; the roles are {', '.join(ROLES)}")
+        stage = STAGE_OF[role]
+        data = _payload(query, LARGEST_MESSAGE)
+        epoch, _, behind = _attachment(query).partition(b"\n")
+        self._check_epoch(role, epoch)
+        if data.startswith(b'{"schema":"Dropped/'):
+            return self._drop(query, loop, stage, data)
+        # Its episode can be driven only once: the state is written together with the record, or neither is.
+        state, table = State.unpack(behind) if behind else (None, None)
+        ack, last = self._ledger.take(loop, stage, data)
+        if ack is Ack.OK and state is not None:
+            self._ledger.keep(role, Snapshot(loop, role, state.pass_no, state.state, table), stage)
+        said = b'{"schema":"Acknowledged/1","ack":"%s","last":%d}' % (ack.value.encode(), last)
+        return Answer(query, said, (role, loop, data) if ack is Ack.OK else None)
+
+    def _drop(self, query: zenoh.Query, loop: int, stage: int, data: bytes) -> Answer:
+        dropped, _ = Dropped.unpack(data)
+        if stage != 0:
+            raise Refusal("only Execute says which episodes were dropped")
+        ack, last = self._ledger.drop(loop, dropped.first, dropped.last)
+        if ack is Ack.OK:
+            count = dropped.last - dropped.first + 1
+            text = f"{count} episodes were driven while Knowledge could not be reached, and are not in the log"
+            self._ledger.note("execute", "dropped", text, loop, dropped.first)
+        return Answer(query, Acknowledged(ack=ack.value, last=last).pack())  # type: ignore[arg-type]
+
+    def _check_epoch(self, role: str, text: bytes) -> None:
+        epoch = _whole(text.decode("ascii", "replace"), "the epoch")
+        newest = self._ledger.epoch(role)
+        if epoch < newest:
+            raise Refusal(f"another {role} has joined since (epoch {newest}; this one has {epoch})")
+        if epoch > newest or epoch == 0:
+            raise Refusal(f"no {role} of epoch {epoch} has joined this Knowledge; was its log lost?")
+
+    # What is asked of Knowledge.
+
+    def asked(self, query: zenoh.Query) -> Answer | None:
+        """Answer what is asked under ``knowledge``; None where the answer comes later.
+
+        Raises
+        ------
+        ValueError, LookupError, MapekError
+            The answer is no, and why. Nothing was changed.
+        """
+        what, _, role = str(query.key_expr).partition("/knowledge/")[2].partition("/")
+        if what == "join":
+            return self._join(query, role)
+        if what == "status":
+            return Answer(query, self._presence.status().pack())
+        if what == "since":
+            return self._since(query)
+        if what == "table":
+            return self._table(query)
+        if what == "snapshot":
+            return self._snapshot(query, role)
+        if what == "remember" and role == "plan":
+            return self._remember(query)
+        if what == "swapped" and role in STAGE_OF:
+            return self._swapped(query, role)
+        if what == "event" and role in STAGE_OF:
+            return self._event(query, role)
+        raise Refusal(f"nothing is asked under {query.key_expr}")
+
+    def _join(self, query: zenoh.Query, role: str) -> Answer:
+        join, _ = Join.unpack(_payload(query, LARGEST_MESSAGE))
+        if role not in STAGE_OF or join.role != role:
+            raise Refusal(f"role {join.role!r} joined as {role!r}; the roles are {', '.join(ROLES)}")
+        for name in ("mapek", "wire"):
+            here, there = self._versions.get(name), join.versions.get(name)
+            if here != there:
+                raise Refusal(
+                    f"{role} is of {name} {there}, Knowledge of {name} {here}; run the same version everywhere"
+                )
+        if self._config is not None and join.config != self._config:
+            name, here, there = first_difference(self._config, join.config)
+            raise Refusal(
+                f"{OF_CONFIG}{role} has another config than Knowledge: {name} is {there!r} in {role}, and {here!r} in "
+                "Knowledge. Give both the same file and the same --set"
+            )
+        if join.layout is not None and role == "execute":
+            self._ledger.begin(join.layout.model_dump(mode="json"))
+        self._presence.joins(join)
+        layout = self._ledger.layout
+        if layout is None:  # who waits for Execute asks again and again, and joins once
+            return Answer(query, Joined(epoch=0, seal="", units=0, layout=None, last=(), swaps=()).pack())
+        epoch = self._ledger.join(role)
+        others = {n: v for n, v in join.versions.items() if self._versions.get(n, v) != v}
+        if others:
+            text = ", ".join(f"{n} {v} there, {self._versions[n]} here" for n, v in others.items())
+            self._ledger.note(role, "versions", f"hashes hold for equal versions only: {text}")
+        self._ledger.note(role, "joined", f"epoch {epoch}, process {join.pid} on {join.host}")
+        told = Layout(
+            signals=layout.signals, detectors=layout.detectors, rates=layout.rates, max_actions=layout.max_actions
+        )
+        begun = self._ledger.store.facts().get("begun", {})
+        joined = Joined(
+            epoch=epoch,
+            seal=self._seal,
+            units=self._ledger.units,
+            layout=told,
+            last=tuple(self._ledger.last(loop) for loop in range(self._ledger.units)),
+            begun=tuple(begun.get(str(loop), 0) for loop in range(self._ledger.units)),
+            snapshot_every=self.snapshot_every,
+            swaps=tuple(
+                Swapped(loop=s.loop, pass_no=s.pass_no, part=s.part, to=s.spec)
+                for s in self._ledger.store.swaps()
+                if not s.planned
+            ),
+        )
+        return Answer(query, joined.pack())
+
+    def _since(self, query: zenoh.Query) -> Answer:
+        loop = _whole(query.parameters.get("loop"), "loop")
+        stages = {}
+        for pair in str(query.parameters.get("from") or "").split(","):
+            stage, _, number = pair.partition(":")
+            stages[_whole(stage, "a stage of `from`")] = _whole(number, "a pass of `from`")
+        if max(stages) >= len(STAGES):
+            raise ValueError(f"stage is {max(stages)}; the stages of a pass are numbered from 0 to {len(STAGES) - 1}")
+        return Answer(query, "\n".join([str(loop), *self._ledger.since(loop, stages, SINCE_LIMIT)]).encode())
+
+    def _snapshot(self, query: zenoh.Query, role: str) -> Answer:
+        if role not in STAGE_OF:
+            raise Refusal(f"role {role!r} has no state; the roles are {', '.join(ROLES)}")
+        if query.payload is None:
+            found = self._ledger.store.snapshot(_whole(query.parameters.get("loop"), "loop"), role)
+            if found is None:
+                return Answer(query, b"")
+            state = State(loop=found.loop, pass_no=found.pass_no, state=found.state, final=found.final)
+            return Answer(query, state.pack(found.table))
+        self._check_epoch(role, _attachment(query))
+        state, table = State.unpack(_payload(query, LARGEST_TABLE))
+        snapshot = Snapshot(self._loop(state.loop), role, state.pass_no, state.state, table, state.final)
+        ack, last = self._ledger.keep(role, snapshot, STAGE_OF[role])
+        return Answer(query, Acknowledged(ack=ack.value, last=last).pack())  # type: ignore[arg-type]
+
+    def _table(self, query: zenoh.Query) -> Answer | None:
+        key = query.parameters.get("sha256")
+        if key is not None:
+            table = self._ledger.store.table(key)
+            if table is None:
+                raise LookupError(f"no Q-table {key[:12]}... is remembered")
+            return Answer(query, Table(loop=None, pass_no=None).pack(table))
+        loop = self._loop(_whole(query.parameters.get("loop"), "loop"))
+        number = _whole(query.parameters.get("pass"), "pass")
+        table = self._ledger.store.version(loop, number)
+        if table is not None:
+            return Answer(query, Table(loop=loop, pass_no=number).pack(table))
+        self._fetch_table(query, loop, number)
+        return None
+
+    def _remember(self, query: zenoh.Query) -> Answer:
+        _, table = Table.unpack(_payload(query, LARGEST_TABLE))
+        if table is None:
+            raise MalformedRecord("a Q-table to remember stands behind its message")
+        return Answer(query, self._ledger.store.keep_table(table, remembered=True).encode())
+
+    def _swapped(self, query: zenoh.Query, role: str) -> Answer:
+        swapped, _ = Swapped.unpack(_payload(query, LARGEST_MESSAGE))
+        self._check_epoch(role, _attachment(query))
+        loop, number = self._loop(swapped.loop), swapped.pass_no
+        if owner(swapped.part) != role:
+            raise Refusal(f"{swapped.part} is a part of {owner(swapped.part)}, not of {role}")
+        if not swapped.planned and number <= self._ledger.last(loop)[STAGE_OF[role]]:
+            raise Refusal(f"pass {number} has been made with the part before; {swapped.part} is replaced after it")
+        self._ledger.swapped(Swap(loop, number, swapped.part, swapped.to, swapped.handed_over, swapped.planned))
+        if not swapped.planned:
+            text = f"from pass {number} on, {swapped.part} is {json.dumps(swapped.to)}"
+            self._ledger.note(role, "swapped", text, loop, number)
+        return Answer(query, b"ok")
+
+    def _event(self, query: zenoh.Query, role: str) -> Answer:
+        happened, _ = Happened.unpack(_payload(query, LARGEST_MESSAGE))
+        self._check_epoch(role, _attachment(query))
+        if happened.kind not in TOLD_BY_ROLES:
+            raise Refusal(f"a role tells of {', '.join(TOLD_BY_ROLES)}; not of {happened.kind!r}")
+        if happened.kind == "begun":  # one per episode: only the last of them counts
+            if role != "execute" or happened.loop is None or happened.pass_no is None:
+                raise Refusal("only Execute begins episodes, and names its loop and episode")
+            loop = self._loop(happened.loop)
+            begun = {**self._ledger.store.facts().get("begun", {}), str(loop): happened.pass_no}
+            self._ledger.store.set_facts(begun=begun)
+            return Answer(query, b"ok")
+        self._ledger.note(role, happened.kind, happened.text, happened.loop, happened.pass_no)
+        return Answer(query, b"ok")
+
+    def _loop(self, number: int) -> int:
+        if not 0 <= number < self._ledger.units:
+            raise ValueError(f"loop {number}; this run has loops 0 to {self._ledger.units - 1}")
+        return number
+
+
+def _payload(query: zenoh.Query, largest: int) -> bytes:
+    payload = query.payload
+    if payload is None:
+        raise MalformedRecord("the question carries nothing; what is sent stands in its payload")
+    if len(payload) > largest:
+        raise MalformedRecord(f"a message of {len(payload)} bytes; at most {largest} are taken here")
+    return bytes(payload.to_bytes())
+
+
+def _attachment(query: zenoh.Query) -> bytes:
+    attachment = query.attachment
+    if attachment is not None and len(attachment) > LARGEST_TABLE:
+        raise MalformedRecord(f"an attachment of {len(attachment)} bytes; at most {LARGEST_TABLE} are taken")
+    return b"" if attachment is None else bytes(attachment.to_bytes())
+
+
+def _whole(text: str | None, what: str) -> int:
+    if text is None or not (text.isascii() and text.isdigit() and len(text) <= 18):
+        raise MalformedRecord(f"{what} is {text!r}; a whole number is taken")
+    return int(text)
