@@ -25,4 +25,4 @@ with Store(Path(sys.argv[1], "log.sqlite"), readonly=True) as store:
                 request = from_json(store.body(loop, number, REQUEST))
                 if request.drifts:
                     print(f"loop {loop}, pass {number}", sentence(request), sentence(from_json(plan)), sep="\n  ")
-        time.sleep(0.1)
+        time.sleep(0.1)  # another process writes the file

@@ -66,7 +66,9 @@ def document() -> dict[str, Any]:
             ("event", "note this beside the records", ("Happened",), ()),
         ):  # fmt: skip
             channel(f"{what}-{role}", wire.ask(f"{what}/{role}"), f"query by {role}: {said}", asked, answered)
-        channel(f"control-{role}", wire.control(role), f"query, answered by {role}", ("Control",), ("Swap", "Table"))
+        channel(
+            f"control-{role}", wire.control(role), f"query, answered by {role}", ("Control",), ("Replaced", "Table")
+        )
         channel(f"beat-{role}", wire.beat(role), f"published by {role}: its heartbeat", ("Beat",))
         channel(f"alive-{role}", wire.alive(role, "{epoch}"), f"liveliness token of {role}", ())
     kinds = tuple(stage.__name__ for stage in STAGES)

@@ -160,7 +160,7 @@ class Happened(Message):
 
 
 class Table(Message):
-    """A Q-table, which stands behind it; `version` is the episode at whose end it was, None for a remembered one."""
+    """A Q-table, which stands behind it, and the episode at whose end it was; None for a remembered one."""
 
     loop: Number | None
     pass_no: Number | None
@@ -186,7 +186,7 @@ class Control(Message):
     pass_no: Number | None = None
 
 
-class Swap(Message):
+class Replaced(Message):
     """A role's answer: from which pass on each loop has the new part, and whether it took over the old one's state."""
 
     part: Name
@@ -232,5 +232,5 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 MESSAGES: tuple[type[Message], ...] = (
-    Acknowledged, Beat, Control, Dropped, Happened, Join, Joined, State, Status, Swap, Swapped, Table,
+    Acknowledged, Beat, Control, Dropped, Happened, Join, Joined, Replaced, State, Status, Swapped, Table,
 )  # fmt: skip

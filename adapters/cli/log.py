@@ -69,7 +69,7 @@ def execute(chosen: argparse.Namespace) -> int:
             printer.flush()
             if over:
                 return 0
-            time.sleep(LOOK_EVERY)
+            time.sleep(LOOK_EVERY)  # another process writes the file, and tells nobody
 
 
 class Cursor:

@@ -6,7 +6,7 @@ import argparse
 import tomllib
 from typing import Any
 
-from adapters.buses.messages import Control, Swap
+from adapters.buses.messages import Control, Replaced
 from adapters.cli.common import operator
 from mape.errors import BusError, ConfigError, MapekError
 from mape.parts import owner
@@ -23,7 +23,7 @@ def execute(chosen: argparse.Namespace) -> int:
         said = None
         for reply in session.get(wire.control(role), payload=control, timeout=ANSWERED_WITHIN):
             if reply.ok is not None:
-                _print(Swap.unpack(reply.ok.payload.to_bytes())[0], chosen.to)
+                _print(Replaced.unpack(reply.ok.payload.to_bytes())[0], chosen.to)
                 return 0
             said = None if reply.err is None else reply.err.payload.to_string()
     if said is None or said == "Timeout":
@@ -46,7 +46,7 @@ def _spec(text: str) -> dict[str, Any]:
     return dict(table)
 
 
-def _print(swap: Swap, to: str) -> None:
+def _print(swap: Replaced, to: str) -> None:
     first, last = min(swap.passes), max(swap.passes)
     when = f"pass {first}" if first == last else f"passes {first} to {last} of {len(swap.passes)} loops"
     kept = "with the state of the one before" if swap.handed_over else "from a fresh start"

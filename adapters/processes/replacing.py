@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import logging
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from adapters.buses.member import Asked, Member
-from adapters.buses.messages import Swap, Swapped
+from adapters.buses.messages import Replaced, Swapped
 from adapters.buses.wire import STAGE_OF
 from adapters.processes.remote import RemoteKnowledge
 from knowledge import MalformedRecord, Record
@@ -67,7 +68,7 @@ class Unit:
         self.done = False
 
 
-class Replacing:
+class Replacing(ABC):
     """What all roles do to replace their parts."""
 
     name: str
@@ -78,11 +79,13 @@ class Replacing:
         self._vetted: deque[tuple[Wanted, list[str]]] = deque()
         self._unanswered: list[Wanted] = []
 
+    @abstractmethod
     def _handle(self, unit: Unit, record: Record) -> None:
-        raise NotImplementedError
+        """Have the component answer a record."""
 
+    @abstractmethod
     def _state(self, unit: Unit) -> tuple[Any] | None:
-        raise NotImplementedError
+        """Return the component's state, or None where its part does not give it."""
 
     def may_replace(self, unit: Unit, number: int) -> bool:
         """Whether a part that is wanted may serve pass `number`, of which the log must not hold this role's record."""
@@ -214,7 +217,7 @@ class Replacing:
         wanted.handed_over = wanted.handed_over and handed_over
         if len(wanted.passes) == wanted.units:
             passes = tuple(wanted.passes[loop] for loop in sorted(wanted.passes))
-            answer = Swap(part=wanted.part, passes=passes, handed_over=wanted.handed_over)
+            answer = Replaced(part=wanted.part, passes=passes, handed_over=wanted.handed_over)
             self._unanswered.remove(wanted)
             self.member.answer(wanted.asked, answer.pack())
 

@@ -190,7 +190,7 @@ class Supervisor:
                 self._look_at(child)
             self._ask()
             tell(self)
-            time.sleep(LOOK_EVERY)
+            time.sleep(LOOK_EVERY)  # a child may die, or Knowledge be silent: no one event tells of both
 
     def _look_at(self, child: Child) -> None:
         assert child.process is not None

@@ -82,8 +82,8 @@ def default_path(name: str) -> Path:
     raise AssertionError
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
-    """Read what runs, or ran, in a folder.
+def read_manifest(path: Path, way_out: str = "name the folder that `mapek` wrote") -> dict[str, Any]:
+    """Read what runs, or ran, in a folder; `way_out` ends the sentence where it cannot be read.
 
     Raises
     ------
@@ -97,10 +97,10 @@ def read_manifest(path: Path) -> dict[str, Any]:
         there = read_json(manifest)
     except ResultsError as error:
         raise ResultsError(
-            f"{manifest} is damaged ({error.__cause__}); what runs in the folder is not known"
+            f"{manifest} is damaged ({error.__cause__}), so the run there cannot be continued; {way_out}"
         ) from error
     if not isinstance(there, dict) or "format" not in there or "agents" not in there:
-        raise ResultsError(f"{manifest} is of no run of ours; name the folder that `mapek` wrote")
+        raise ResultsError(f"{manifest} is of no run of ours; {way_out}")
     return there
 
 
@@ -185,14 +185,7 @@ class RunFolder:
             return
         if (self.path / "result.json").exists():
             raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
-        try:
-            there = read_json(manifest)
-        except ResultsError as error:
-            raise ResultsError(
-                f"{manifest} is damaged ({error.__cause__}), so the run there cannot be continued; choose another --out"
-            ) from error
-        if not isinstance(there, dict) or "format" not in there or "agents" not in there:
-            raise ResultsError(f"{manifest} is of no run of ours; choose another --out")
+        there = read_manifest(self.path, "choose another --out")
         runs = {name: value for name, value in there.items() if name not in BEGUN_BY}
         if runs != wanted:
             what, had, has = first_difference(runs, wanted)

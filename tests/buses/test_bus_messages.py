@@ -18,10 +18,10 @@ from adapters.buses.messages import (
     Happened,
     Join,
     Joined,
+    Replaced,
     RoleStatus,
     State,
     Status,
-    Swap,
     Swapped,
     Table,
 )
@@ -42,7 +42,7 @@ EXAMPLES = [
         system="s", name="n", mode="free", episodes=9, units=1, passes=3, last=("", "", "", "{}"),
         roles={"plan": ROLE}, refused=0, dropped=0, complete=False, pid=1,
     ),
-    Swap(part="plan", passes=(3, 4), handed_over=False),
+    Replaced(part="plan", passes=(3, 4), handed_over=False),
     SWAPPED,
     Table(loop=None, pass_no=None),
 ]  # fmt: skip

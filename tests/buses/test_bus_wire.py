@@ -7,7 +7,7 @@ from adapters.buses.wire import INPUT, ROLES, STAGE_OF, role_of, system_segment
 from knowledge import STAGES
 from mape.errors import ConfigError
 
-UNIX = "unixsock-stream//tmp/k.sock"
+UNIX = "unixsock-stream//run/k.sock"
 
 
 @pytest.mark.parametrize("name", ["", "Grid", "a/b", "a*", "@adv", "a b", "ü", "a\n", "$*", "a#b", "a?b", "**"])
@@ -35,7 +35,7 @@ def test_an_id_of_which_no_letter_may_stand_is_refused():
 @pytest.mark.parametrize(
     "endpoint",
     ["", "tcp", "tcp/127.0.0.1", "tcp/127.0.0.1:0", "tcp/127.0.0.1:70000", "udp/127.0.0.1:1", "unixsock-stream/",
-     "unixsock-stream//tmp/a?b", "unixsock-stream//tmp/a#b", "unixsock-stream//tmp/a;b", "tcp/127.0.0.1:7447#x=1"],
+     "unixsock-stream//run/a?b", "unixsock-stream//run/a#b", "unixsock-stream//run/a;b", "tcp/127.0.0.1:7447#x=1"],
 )  # fmt: skip
 def test_what_is_no_endpoint_is_refused(endpoint):
     with pytest.raises(ConfigError, match="endpoint"):

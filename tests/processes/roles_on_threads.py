@@ -8,7 +8,7 @@ from bus_small_loop import Distributed, small_config
 from real_processes import last, passes, until
 
 from adapters.buses import Wire
-from adapters.buses.messages import Control, Swap
+from adapters.buses.messages import Control, Replaced
 from adapters.buses.wire import ROLES
 from mape.analyze.changes import Changes
 from mape.config import from_table, merge
@@ -111,7 +111,7 @@ class Roles(Distributed):
 
         def answer():
             (reply,) = answers
-            return Swap.unpack(reply.ok.payload.to_bytes())[0] if reply.ok else reply.err.payload.to_string()
+            return Replaced.unpack(reply.ok.payload.to_bytes())[0] if reply.ok else reply.err.payload.to_string()
 
         return answer
 
