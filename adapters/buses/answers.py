@@ -20,19 +20,13 @@ from adapters.buses.messages import (
     Table,
 )
 from adapters.buses.presence import Presence
-from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, ROLES, STAGE_OF
+from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, OF_CONFIG, ROLES, SINCE_LIMIT, STAGE_OF
 from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
 from knowledge import STAGES, Ack, MalformedRecord
 from mape.errors import BusError
 from mape.parts import owner
 from mape.tables import first_difference
-
-SINCE_LIMIT = 512
-"""Most records in one answer to `since`; a shorter answer reaches the end of the log."""
-
-OF_CONFIG = "config: "
-"""What a refusal begins with that is a matter of the config."""
 
 TOLD_BY_ROLES = ("begun", "aborted", "swap refused")
 """Kinds of events that a role may tell; the others are Knowledge's own word."""

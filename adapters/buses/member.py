@@ -17,19 +17,16 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from adapters.buses.answers import OF_CONFIG, SINCE_LIMIT
-from adapters.buses.messages import Beat, Control, Dropped, Happened, Join, Joined, Layout, State, Swapped, Table
-from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, STAGE_OF, Wire, hand_over, host
-from knowledge import STAGES, MalformedRecord, QTable, Record, from_json, to_json
-from mape.errors import BusError, ConfigError
+from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout
+from adapters.buses.questions import ANSWER_WITHIN, Questions, Refused
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, SINCE_LIMIT, STAGE_OF, Wire, hand_over, host
+from knowledge import STAGES, MalformedRecord, Record, from_json, to_json
+from mape.errors import BusError
 
 logger = logging.getLogger(__name__)
 
 SILENCE = 0.3
 """Seconds without a publication after which Knowledge is asked whether one was missed."""
-
-ANSWER_WITHIN = 2.0
-"""Seconds after which a question counts as lost, and is asked again."""
 
 RESEND_AFTER = 0.5
 """Seconds without an acknowledgement after which a record is sent again."""
@@ -50,18 +47,11 @@ BEAT_EVERY = 0.5
 """Seconds between two heartbeats."""
 
 
-class Refused(BusError):
-    """Knowledge said no; to ask again would not change it."""
-
-
 class Asked(NamedTuple):
     """A question to this role; answer it by `Member.answer` or `Member.refuse`."""
 
     query: zenoh.Query
     control: Control
-
-
-_UNHEARD: Any = zenoh.handlers.Callback(lambda reply: None, indirect=False)
 
 
 class _Sent(NamedTuple):
@@ -71,7 +61,7 @@ class _Sent(NamedTuple):
     at: float
 
 
-class Member:
+class Member(Questions):
     """One role's link to Knowledge, for all loops of the run.
 
     Nothing rests on delivery. A record is sent until Knowledge has acknowledged it, which appends it once however often
@@ -108,15 +98,11 @@ class Member:
         patience: float | None = None,
         waiting: Callable[[str], object] = lambda sentence: None,
     ) -> None:
-        self.wire = wire
-        self.role = role
-        self.patience = patience
+        super().__init__(wire, role, patience, waiting)
         self.joined = Joined(epoch=0, seal="", units=0, layout=None, last=(), swaps=())
         self.refused = 0
         self.passes = 0  # for the heartbeat: what all loops together have done
         self._config, self._versions, self._layout = dict(config or {}), dict(versions or {}), layout
-        self._tell = waiting
-        self._told = ""
         self._input = STAGES.index(INPUT[role])
         self._arrived: SimpleQueue[Any] = SimpleQueue()  # filled by Zenoh's threads, and by nobody else
         self._waiting: deque[Record | Asked] = deque()
@@ -126,10 +112,7 @@ class Member:
         self._heard: dict[int, float] = {}  # when something of a loop came last, or was asked for
         self._fetched: set[int] = set()  # loops of which an answer is awaited
         self._kept_up_at = self._beat_at = 0.0
-        self._deaf_since: float | None = None  # the first question that was lost, of those since the last answer
-        self._session: zenoh.Session | None = None
         self._seal = b""
-        self._epoch = b""
         self._leave: Callable[..., object] | None = None
 
     # Coming and going.
@@ -228,11 +211,6 @@ class Member:
         leave()
         self._fetched.clear()
         self._attach(another, lambda: None)
-
-    def _say(self, sentence: str) -> None:
-        if sentence != self._told:
-            self._told = sentence
-            self._tell(sentence)
 
     # Sending.
 
@@ -476,105 +454,7 @@ class Member:
         if news and len(lines) > SINCE_LIMIT and int(lines[0]) in self._next:
             self._fetch(int(lines[0]))
 
-    # Questions.
-
-    def ask(
-        self, what: str, payload: bytes | None = None, attachment: bytes | None = None, deadline: float | None = None
-    ) -> bytes:
-        """Ask Knowledge, again until it answers.
-
-        Raises
-        ------
-        Refused
-            It says no, and why.
-        ConfigError
-            It has another config.
-        BusError
-            It does not answer within the patience.
-        """
-        if self._session is None:
-            raise BusError(f"{self.role} is not connected; call connect()")
-        if deadline is None and self.patience is not None:
-            deadline = time.monotonic() + self.patience
-        pause, tick = 0.005, threading.Event()
-        while True:
-            # Nobody there, a hub that fell over the question, and one that is just restarting look the same: no reply.
-            # To ask again is safe, as Knowledge takes everything once.
-            outcome = "no reply"
-            for reply in self._session.get(
-                self.wire.ask(what), payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
-            ):
-                if reply.ok is not None:
-                    self._deaf_since = None
-                    return bytes(reply.ok.payload.to_bytes())
-                outcome = "Timeout" if reply.err is None else reply.err.payload.to_string()
-                if outcome.startswith(OF_CONFIG):
-                    raise ConfigError(outcome.removeprefix(OF_CONFIG))
-                if outcome != "Timeout" and not outcome.startswith("later: "):
-                    raise Refused(f"{self.role} is refused by Knowledge: {outcome}")
-            if outcome == "Timeout":
-                self._lost()
-            if deadline is not None and time.monotonic() > deadline:
-                raise BusError(
-                    f"Knowledge on {self.wire.endpoint} did not answer {self.role} ({outcome}). Is it running, with "
-                    "the same system?"
-                )
-            if pause > 0.1:
-                self._say(f"waiting for Knowledge on {self.wire.endpoint}")
-            # No event tells that a queryable is there again; where one reply was lost, the first pause is short.
-            tick.wait(pause)
-            pause = min(2 * pause, 0.2)
-
-    def snapshot(self, loop: int) -> tuple[State, QTable | None] | None:
-        """Return this role's newest state of a loop, or None where it has none."""
-        found = self.ask(f"snapshot/{self.role}?loop={loop}")
-        return State.unpack(found) if found else None
-
-    def keep(self, state: State, table: QTable | None = None) -> None:
-        """Have a state kept; that it got lost does no harm, as another one will follow."""
-        self._mention(f"snapshot/{self.role}", state.pack(table), self._epoch)
-
-    def _mention(self, what: str, payload: bytes, attachment: bytes | None = None) -> None:
-        """Ask Knowledge once, and do not wait for the answer."""
-        if self._session is None:
-            raise BusError(f"{self.role} is not connected; call connect()")
-        self._session.get(
-            self.wire.ask(what), _UNHEARD, payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
-        )
-
-    def keep_surely(self, state: State, table: QTable | None = None) -> None:
-        """Have a state kept, and wait for the answer."""
-        self.ask(f"snapshot/{self.role}", state.pack(table), self._epoch)
-
-    def swapped(self, swap: Swapped) -> None:
-        """Have it kept that a part was replaced; from its pass on every restart uses the new one."""
-        self.ask(f"swapped/{self.role}", swap.pack(), self._epoch)
-
-    def note(
-        self, kind: str, text: str, loop: int | None = None, number: int | None = None, *, surely: bool = True
-    ) -> None:
-        """Note an event beside the records; `surely` waits for the answer."""
-        what, payload = f"event/{self.role}", Happened(kind=kind, text=text, loop=loop, pass_no=number).pack()
-        if surely:
-            self.ask(what, payload, self._epoch)
-        else:
-            self._mention(what, payload, self._epoch)
-
-    def history(self, loop: int, stages: Mapping[int, int]) -> list[Record]:
-        """Return the records of the stages named, each from its pass on; as many as fit into one answer."""
-        wanted = ",".join(f"{stage}:{number}" for stage, number in stages.items())
-        return [from_json(line) for line in self.ask(f"since?loop={loop};from={wanted}").splitlines()[1:]]
-
-    def table(self, which: str) -> QTable:
-        """Return a Q-table, by ``sha256=...`` or by ``loop=...;pass=...``."""
-        _, table = Table.unpack(self.ask(f"table?{which}"))
-        if table is None:
-            raise BusError("Knowledge answered without the Q-table that it was asked for")
-        return table
-
-    def remember(self, table: QTable) -> str:
-        """Have a Q-table kept for a later plan; return its hash."""
-        return self.ask("remember/plan", Table(loop=None, pass_no=None).pack(table)).decode()
+    # Answering, and being alive.
 
     def answer(self, asked: Asked, payload: bytes) -> None:
         """Answer a question to this role."""

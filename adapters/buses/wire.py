@@ -61,6 +61,12 @@ LARGEST_MESSAGE = 1 << 20
 LARGEST_TABLE = 1 << 30
 """Bytes of the largest message with a Q-table that is taken."""
 
+SINCE_LIMIT = 512
+"""Most records in one answer to `since`; a shorter answer reaches the end of the log."""
+
+OF_CONFIG = "config: "
+"""What a refusal begins with that is a matter of the config."""
+
 LEASE_MS = 2_000
 """After that long a process that is frozen, or cut off, is taken for gone; one that died is seen at once."""
 

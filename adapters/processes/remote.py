@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Iterator
 from typing import cast
 
-from adapters.buses.member import Member, Refused
+from adapters.buses.member import Member
+from adapters.buses.questions import Refused
 from knowledge import STAGES, Knowledge, Log, Observation, Pass, QTable, Record, RowLayout
 
 WINDOW = 256

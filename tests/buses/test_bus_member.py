@@ -6,9 +6,10 @@ import pytest
 from bus_peers import Site, ask, eventually, play_part, received, serve_questions, status
 from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
-from adapters.buses import Member, answers, hub, member
-from adapters.buses.member import Asked, Refused
+from adapters.buses import Member, answers, hub, member, questions
+from adapters.buses.member import Asked
 from adapters.buses.messages import Control, State, Swapped, Table
+from adapters.buses.questions import Refused
 from adapters.buses.wire import INPUT, ORDERED, ROLES
 from knowledge import Observation, QTable, to_json
 from mape.errors import BusError, ConfigError
@@ -672,7 +673,8 @@ def test_one_whose_link_stands_and_is_dead_opens_another_session(site, all_four,
 
 
 def test_one_that_waits_for_a_busy_knowledge_keeps_its_session(site, all_four, monkeypatch):
-    monkeypatch.setattr(member, "ANSWER_WITHIN", 0.1)
+    for module in (member, questions):
+        monkeypatch.setattr(module, "ANSWER_WITHIN", 0.1)
     held, true_take = threading.Event(), site.ledger.take
     monkeypatch.setattr(site.ledger, "take", lambda *given: (held.wait(10), true_take(*given))[1])
     planner, first, lost = all_four["plan"], all_four["plan"]._session, []

@@ -1,0 +1,152 @@
+"""What a role asks of Knowledge, again until it is answered."""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+
+from adapters.buses.messages import Happened, State, Swapped, Table
+from adapters.buses.wire import OF_CONFIG, ORDERED, Wire
+from knowledge import QTable, Record, from_json
+from mape.errors import BusError, ConfigError
+
+ANSWER_WITHIN = 2.0
+"""Seconds after which a question counts as lost, and is asked again."""
+
+_UNHEARD: Any = zenoh.handlers.Callback(lambda reply: None, indirect=False)
+
+
+class Refused(BusError):
+    """Knowledge said no; to ask again would not change it."""
+
+
+class Questions(ABC):
+    """The questions of one role; `Member` has the session over which they go.
+
+    Parameters
+    ----------
+    wire, role, patience, waiting
+        As `Member` takes them.
+    """
+
+    def __init__(self, wire: Wire, role: str, patience: float | None, waiting: Callable[[str], object]) -> None:
+        self.wire = wire
+        self.role = role
+        self.patience = patience
+        self._tell = waiting
+        self._told = ""
+        self._session: zenoh.Session | None = None
+        self._epoch = b""
+        self._deaf_since: float | None = None  # the first question that was lost, of those since the last answer
+
+    @abstractmethod
+    def _lost(self) -> None:
+        """Take note that a question was lost."""
+
+    def _say(self, sentence: str) -> None:
+        if sentence != self._told:
+            self._told = sentence
+            self._tell(sentence)
+
+    def ask(
+        self, what: str, payload: bytes | None = None, attachment: bytes | None = None, deadline: float | None = None
+    ) -> bytes:
+        """Ask Knowledge, again until it answers.
+
+        Raises
+        ------
+        Refused
+            It says no, and why.
+        ConfigError
+            It has another config.
+        BusError
+            It does not answer within the patience.
+        """
+        if self._session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        if deadline is None and self.patience is not None:
+            deadline = time.monotonic() + self.patience
+        pause, tick = 0.005, threading.Event()
+        while True:
+            # Nobody there, a hub that fell over the question, and one that is just restarting look the same: no reply.
+            # To ask again is safe, as Knowledge takes everything once.
+            outcome = "no reply"
+            for reply in self._session.get(
+                self.wire.ask(what), payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
+            ):
+                if reply.ok is not None:
+                    self._deaf_since = None
+                    return bytes(reply.ok.payload.to_bytes())
+                outcome = "Timeout" if reply.err is None else reply.err.payload.to_string()
+                if outcome.startswith(OF_CONFIG):
+                    raise ConfigError(outcome.removeprefix(OF_CONFIG))
+                if outcome != "Timeout" and not outcome.startswith("later: "):
+                    raise Refused(f"{self.role} is refused by Knowledge: {outcome}")
+            if outcome == "Timeout":
+                self._lost()
+            if deadline is not None and time.monotonic() > deadline:
+                raise BusError(
+                    f"Knowledge on {self.wire.endpoint} did not answer {self.role} ({outcome}). Is it running, with "
+                    "the same system?"
+                )
+            if pause > 0.1:
+                self._say(f"waiting for Knowledge on {self.wire.endpoint}")
+            # No event tells that a queryable is there again; where one reply was lost, the first pause is short.
+            tick.wait(pause)
+            pause = min(2 * pause, 0.2)
+
+    def snapshot(self, loop: int) -> tuple[State, QTable | None] | None:
+        """Return this role's newest state of a loop, or None where it has none."""
+        found = self.ask(f"snapshot/{self.role}?loop={loop}")
+        return State.unpack(found) if found else None
+
+    def keep(self, state: State, table: QTable | None = None) -> None:
+        """Have a state kept; that it got lost does no harm, as another one will follow."""
+        self._mention(f"snapshot/{self.role}", state.pack(table), self._epoch)
+
+    def _mention(self, what: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Ask Knowledge once, and do not wait for the answer."""
+        if self._session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        self._session.get(
+            self.wire.ask(what), _UNHEARD, payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
+        )
+
+    def keep_surely(self, state: State, table: QTable | None = None) -> None:
+        """Have a state kept, and wait for the answer."""
+        self.ask(f"snapshot/{self.role}", state.pack(table), self._epoch)
+
+    def swapped(self, swap: Swapped) -> None:
+        """Have it kept that a part was replaced; from its pass on every restart uses the new one."""
+        self.ask(f"swapped/{self.role}", swap.pack(), self._epoch)
+
+    def note(
+        self, kind: str, text: str, loop: int | None = None, number: int | None = None, *, surely: bool = True
+    ) -> None:
+        """Note an event beside the records; `surely` waits for the answer."""
+        what, payload = f"event/{self.role}", Happened(kind=kind, text=text, loop=loop, pass_no=number).pack()
+        if surely:
+            self.ask(what, payload, self._epoch)
+        else:
+            self._mention(what, payload, self._epoch)
+
+    def history(self, loop: int, stages: Mapping[int, int]) -> list[Record]:
+        """Return the records of the stages named, each from its pass on; as many as fit into one answer."""
+        wanted = ",".join(f"{stage}:{number}" for stage, number in stages.items())
+        return [from_json(line) for line in self.ask(f"since?loop={loop};from={wanted}").splitlines()[1:]]
+
+    def table(self, which: str) -> QTable:
+        """Return a Q-table, by ``sha256=...`` or by ``loop=...;pass=...``."""
+        _, table = Table.unpack(self.ask(f"table?{which}"))
+        if table is None:
+            raise BusError("Knowledge answered without the Q-table that it was asked for")
+        return table
+
+    def remember(self, table: QTable) -> str:
+        """Have a Q-table kept for a later plan; return its hash."""
+        return self.ask("remember/plan", Table(loop=None, pass_no=None).pack(table)).decode()
