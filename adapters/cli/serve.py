@@ -27,7 +27,8 @@ from mape.errors import ConfigError
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
     prepare()
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(asctime)s %(levelname)s %(message)s")
+    logging.getLogger("adapters").setLevel(logging.INFO)  # ours alone: who draws the figures has much to say
     # At its end the interpreter looks through all objects again and again; of compiled code there are many.
     atexit.register(gc.freeze)
     if chosen.leash:

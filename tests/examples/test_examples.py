@@ -134,7 +134,7 @@ def served(here):
     lines = [line.replace("7447", port) for line in _lines("mapek serve") if "--tls" not in line]
     assert [shlex.split(line)[4] for line in lines] == ["knowledge", "monitor", "analyze", "plan", "execute"]
     lines.append(lines.pop(3))
-    lines[0] += " -q --no-figures"
+    lines[0] += " -q"
     with contextlib.ExitStack() as opened:
 
         def start(arguments, name):
@@ -172,6 +172,14 @@ def test_the_readmes_processes_come_to_the_hashes_of_one_process(goals, served, 
 def test_status_says_who_is_there_and_who_is_not(served):
     states = dict(re.findall(r"^(\w+) +(here|away)", served[1], flags=re.MULTILINE))
     assert states == dict.fromkeys(("execute", "monitor", "analyze", "knowledge"), "here") | {"plan": "away"}
+
+
+def test_knowledge_speaks_of_the_run_alone(served, here):
+    """And not of what draws its figures, which has much to say."""
+    said = (here / "0.said").read_text()
+    assert "Knowledge listens on" in said
+    assert "INFO" in said
+    assert "subset" not in said
 
 
 def test_each_drift_and_the_plan_that_answered_it_are_seen_while_the_run_goes_on_and_later(goals, served, here, alone):
