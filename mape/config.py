@@ -86,9 +86,20 @@ class SystemConfig(PartConfig):
     )
     max_actions: int = Field(64, ge=1, le=4096, description="largest number of actions that the records can hold")
     discretise: BoxGrid | None = None
+    tabulated: bool = Field(
+        False, description="play the environment's own transition table, by rules that can be compiled"
+    )
     redrivable: bool | None = Field(
         None, description="whether an episode can be driven again after others; by default as the system says, or true"
     )
+
+    @model_validator(mode="after")
+    def _one_view(self) -> SystemConfig:
+        if self.tabulated and self.discretise is not None:
+            raise ValueError(
+                "tabulated = true plays a table of states, and discretise makes one of real observations; leave one out"
+            )
+        return self
 
 
 class MonitorConfig(PartConfig):

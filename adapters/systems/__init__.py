@@ -1,8 +1,9 @@
 """Managed systems: any Gymnasium environment with discrete actions."""
 
 from adapters.systems.gymnasium_system import GymnasiumSystem, make_system
+from adapters.systems.tabulated import Tabulated
 
-__all__ = ["SYSTEMS", "GymnasiumSystem", "make_system"]
+__all__ = ["SYSTEMS", "GymnasiumSystem", "Tabulated", "make_system"]
 
 SYSTEMS = {
     "mapek/Gridworld-v0": "goals that move, walls, slip, actions that come and go",

@@ -1,4 +1,4 @@
-"""A Gymnasium environment as a managed system, unmodified."""
+"""A Gymnasium environment as a managed system: unmodified, or played from its transition table."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from adapters.systems.state_index import state_index
+from adapters.systems.tabulated import Tabulated
+from adapters.systems.wrappers import altering_wrapper, least_cap, step_caps
 from managed_systems import register_envs
 from managed_systems.rules import available
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
 
-_TRANSPARENT = (OrderEnforcing, PassiveEnvChecker, TimeLimit)
 _RULES = tuple(name for name in vars(StepRules) if not name.startswith("_"))
 
 
@@ -34,13 +34,23 @@ def make_system(config: SystemConfig) -> GymnasiumSystem:
 
 
 def make_env(config: SystemConfig) -> gymnasium.Env[Any, Any]:
-    """Make the environment that a config names.
+    """Make the environment that a config names, or another one of its transition table where the config asks for that.
 
     Raises
     ------
     ConfigError
-        There is no such environment, or it refuses its options.
+        There is no such environment, it refuses its options, or it has no table that could be played.
     """
+    env = _make_by_id(config)
+    if not config.tabulated:
+        return env
+    try:
+        return Tabulated(env, config.max_steps)
+    finally:
+        env.close()
+
+
+def _make_by_id(config: SystemConfig) -> gymnasium.Env[Any, Any]:
     register_envs()
     try:
         # Gymnasium's passive checker would cost every step, and warn at every reset; `mapek check` looks once.
@@ -64,31 +74,13 @@ def make_env(config: SystemConfig) -> gymnasium.Env[Any, Any]:
 
 
 def rules_of(env: gymnasium.Env[Any, Any]) -> StepRules | None:
-    """Return the rules that equal the environment's steps, or None where it has none.
-
-    Rules are those of the innermost environment: whatever a wrapper does to observations, actions or rewards is not in
-    them, so they count only below wrappers that leave all as it is but for the number of steps.
-    """
-    while isinstance(env, gymnasium.Wrapper):
-        if type(env) not in _TRANSPARENT:  # a subclass may do anything
-            return None
-        env = env.env
-    return _own_rules(env)
+    """Return the rules that equal the environment's steps, or None where it has none, or a wrapper may alter them."""
+    return None if altering_wrapper(env) is not None else _own_rules(env.unwrapped)
 
 
 def _own_rules(base: Any) -> StepRules | None:
     rules = getattr(base, "rules", None)  # the name is a common one
     return rules if all(hasattr(rules, name) for name in _RULES) else None
-
-
-def _step_caps(env: gymnasium.Env[Any, Any]) -> list[int | None]:
-    """Return the step cap that the spec names, and those of time limits that the outermost one hides."""
-    caps = [None if env.spec is None else env.spec.max_episode_steps]
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, TimeLimit) and env.spec is not None:
-            caps.append(env.spec.max_episode_steps)
-        env = env.env
-    return caps
 
 
 class GymnasiumSystem:
@@ -113,13 +105,7 @@ class GymnasiumSystem:
         self.n_states, self._index = state_index(env.observation_space, config.discretise, self.name)
         self.rules: StepRules | None = rules_of(env)
         rules: Any = _own_rules(self._base)  # what they declare holds below any wrapper
-        declared = [config.max_steps, getattr(rules, "max_steps", None), *_step_caps(env)]
-        caps = [cap for cap in declared if cap is not None]
-        if not caps:
-            raise ConfigError(
-                f"{self.name} has no step cap of its own, and an episode must end; set system.max_steps, such as 200"
-            )
-        self.max_steps = int(min(caps))
+        self.max_steps = least_cap(self.name, [config.max_steps, getattr(rules, "max_steps", None), *step_caps(env)])
         self.signal_names: tuple[str, ...] = tuple(
             getattr(rules, "signal_names", getattr(self._base, "signal_names", ()))
         )

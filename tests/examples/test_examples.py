@@ -58,6 +58,19 @@ def test_a_pass_is_taught_in_about_20_lines_and_says_all_four_records():
     assert [line.split()[1] for line in done.stdout.splitlines()] == ["Plan", "Execute", "Monitor", "Analyze", "Plan"]
 
 
+@pytest.mark.parametrize("name", ["frozen_lake", "cliff_walking", "taxi"])
+def test_a_toy_text_is_itself_by_default_and_its_table_with_a_profile(name):
+    path = ROOT / "examples" / f"{name}.toml"
+    assert make_system(load(path).system).rules is None
+    chosen = [
+        load(path, profile="tabulated", overrides=["episodes=40", f"execute.engine={engine}"])
+        for engine in ("python", "compiled")
+    ]
+    called, compiled = (run_trial(one, 0, make_system) for one in chosen)
+    assert compiled.log_sha256 == called.log_sha256
+    assert compiled.q_table_sha256 == called.q_table_sha256
+
+
 def _commands():
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
     lines = [line for language, block in blocks if not language for line in block.splitlines()]
