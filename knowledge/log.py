@@ -76,7 +76,8 @@ class Log:
         self.layout = layout
         self.loop = loop
         self.passes = 0  # finished passes
-        self.window: deque[Pass] = deque(maxlen=window)
+        self._window: deque[Pass] = deque(maxlen=window)
+        self._unread: deque[Sequence[Pass]] = deque()  # newer than these, and not looked at yet
         self._start: ChangePlan | None = None
         self._open: list[Any] = []  # the records of the pass that is being logged
         self._number = -1  # the pass whose record is expected next; none before plan 0
@@ -136,7 +137,11 @@ class Log:
         seen, symptom, request = self._open
         self.layout.pack_into(self._buffer, self._filled, seen, symptom, request, plan)
         self._filled += self._row_size
-        self.window.append(_new(Pass, (seen, symptom, request, plan)))
+        passed = _new(Pass, (seen, symptom, request, plan))
+        if self._unread:
+            self._unread.append((passed,))
+        else:
+            self._window.append(passed)
         self._open = []
         self._expected = Observation
         self.passes = self._number
@@ -160,6 +165,48 @@ class Log:
         if there is not None:
             return Ack.DUPLICATE if there == record else Ack.CONFLICT
         return Ack.DUPLICATE if number <= self.passes else Ack.GAP
+
+    def room(self) -> int:
+        """Return how many passes can be finished before the listeners hear of them; if none, let them hear first."""
+        if self._filled == len(self._buffer):
+            self._flush()
+        return (len(self._buffer) - self._filled) // self._row_size
+
+    def extend(self, rows: npt.NDArray[np.void], read: Callable[[Any], Pass]) -> None:
+        """Take finished passes as the rows that their records would be packed into.
+
+        Parameters
+        ----------
+        rows
+            Rows of the passes that come next, as many as there is `room` for; they are the log's from now on.
+        read
+            Turns one of them into the records of its pass; asked when somebody looks at them.
+
+        Raises
+        ------
+        ValueError
+            They are not of the log's layout, or not the passes that come next, or too many.
+        """
+        in_order = np.arange(self._number, self._number + len(rows))
+        if self._expected is not Observation or rows.dtype != self.layout.dtype or (rows["pass"] != in_order).any():
+            raise ValueError(f"rows of other passes than {self._number} and those after it were sent to the log")
+        end = self._filled + rows.nbytes
+        if end > len(self._buffer):
+            raise ValueError(f"{len(rows)} rows were sent to a log that has room for {self.room()}")
+        self._buffer[self._filled : end] = rows.tobytes()
+        self._filled = end
+        self.passes += len(rows)
+        self._number += len(rows)
+        self._unread.append(_Unread(rows, read))
+        while sum(map(len, self._unread)) - len(self._unread[0]) >= (self._window.maxlen or 0):
+            self._unread.popleft()
+
+    @property
+    def window(self) -> deque[Pass]:
+        """The newest finished passes, oldest first."""
+        while self._unread:
+            self._window.extend(self._unread.popleft())
+        return self._window
 
     @property
     def started(self) -> bool:
@@ -301,6 +348,19 @@ class Log:
         self._filled = 0
         for listener in self._listeners:
             listener.told = 0
+
+
+class _Unread(Sequence[Pass]):
+    # Passes as rows, read when they are looked at.
+    def __init__(self, rows: npt.NDArray[np.void], read: Callable[[Any], Pass]) -> None:
+        self._rows = rows
+        self._read = read
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, at: Any) -> Any:
+        return self._read(self._rows[at])
 
 
 class _Listener:

@@ -11,10 +11,13 @@ import struct
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from knowledge.records import ChangePlan, ChangeRequest, Direction, Drift, Observation, Reading, Symptom
 
-DIRECTIONS = {"down": 1, "up": 2, "unknown": 3}
+DOWN, UP, UNKNOWN = 1, 2, 3
+
+DIRECTIONS: dict[Direction, int] = {"down": DOWN, "up": UP, "unknown": UNKNOWN}
 """Codes of a drift's direction in a row; 0 stands for no drift."""
 
 _WORD = (1 << 64) - 1
@@ -136,6 +139,14 @@ class RowLayout:
             )
         except struct.error as error:
             raise self._misfit(seen, str(error)) from error
+
+    def repeat(
+        self, passed: tuple[Observation, Symptom, ChangeRequest, ChangePlan], count: int
+    ) -> npt.NDArray[np.void]:
+        """Return `count` rows that all say one pass, to be written over."""
+        row = bytearray(self.struct.size)
+        self.pack_into(row, 0, *passed)
+        return np.frombuffer(row * count, self.dtype)
 
     def _misfit(self, seen: Observation, why: str) -> ValueError:
         return ValueError(

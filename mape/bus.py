@@ -34,6 +34,11 @@ class LocalBus:
         """Deliver every record of `kind` to `handler`, after those that subscribed before."""
         self._handlers[kind].append(handler)
 
+    @property
+    def subscriptions(self) -> int:
+        """Number of handlers, of all kinds."""
+        return sum(map(len, self._handlers.values()))
+
     def send(self, record: Record) -> None:
         """Append `record` and queue it; what is there already is not delivered again.
 

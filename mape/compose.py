@@ -21,6 +21,7 @@ import importlib.util
 import inspect
 import os
 import platform
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -45,11 +46,15 @@ class Composed:
         A module-level function.
     bindings
         Free name -> rule, or -> another `Composed`.
+    apart
+        Whether another `Composed`, to which this one is bound, calls it as a function that is compiled by itself, and
+        once for all who do. Else it becomes a part of the other, which is faster, and takes longer to compile.
     """
 
-    def __init__(self, template: Rule, bindings: Bindings) -> None:
+    def __init__(self, template: Rule, bindings: Bindings, *, apart: bool = False) -> None:
         self.template = template
         self.bindings = dict(bindings)
+        self.apart = apart
 
     def python(self) -> Rule:
         """Return the bound function as plain Python."""
@@ -61,23 +66,34 @@ class Composed:
         """Return the text of a module that defines the bound function, compiled."""
         imports: dict[str, str] = {"njit": "from numba import njit"}
         body: list[str] = []
-        self._write(imports, body, self.template.__name__, "@njit(cache=True)")
+        self._write(imports, {}, body, self.template.__name__, "@njit(cache=True, _nrt=False)")
         head = ['"""Written by mapek; safe to delete."""', "", "from __future__ import annotations", ""]
         return "\n".join([*head, *imports.values(), "", "", *body])
 
-    def _write(self, imports: dict[str, str], body: list[str], name: str, decorator: str) -> None:
+    def _write(
+        self, imports: dict[str, str], means: dict[str, Any], body: list[str], name: str, decorator: str
+    ) -> None:
         template: Any = self.template
+        definition = inspect.getsource(template).split("(", 1)[1]
         for free, rule in self.bindings.items():
+            # A template may be bound several times in one module, each time to something else.
+            alias = f"{name}__{free}"
+            definition = re.sub(rf"(?<![.\w]){free}\b", alias, definition)
             if isinstance(rule, Composed):
-                rule._write(imports, body, free, "@njit(forceinline=True)")
-            else:
-                imports[free] = f"from {rule.__module__} import {rule.__qualname__} as {free}"
+                if not rule.apart:
+                    rule._write(imports, means, body, alias, "@njit(forceinline=True, _nrt=False)")
+                    continue
+                rule = rule.compiled().py_func
+            imports[alias] = f"from {rule.__module__} import {rule.__qualname__} as {alias}"
         for used in sorted(_names(template.__code__)):
             if used in template.__globals__ and used not in self.bindings:
-                line = f"from {template.__module__} import {used}"
-                if imports.setdefault(used, line) != line:
+                value = template.__globals__[used]
+                if isinstance(value, ModuleType):
+                    imports.setdefault(used, f"import {value.__name__} as {used}")
+                else:
+                    imports.setdefault(used, f"from {template.__module__} import {used}")
+                if means.setdefault(used, value) is not value:
                     raise ConfigError(f"two templates mean different things by {used!r}; rename one")
-        definition = inspect.getsource(template).split("(", 1)[1]
         body.append(f"{decorator}\ndef {name}({definition}\n")
 
     def rules(self) -> Iterator[Rule]:
@@ -191,11 +207,11 @@ def _load(text: str, key: str, name: str, rules: tuple[Rule, ...]) -> Any:
     return getattr(module, name)
 
 
-def specialise(dispatcher: Any, arguments: tuple[Any, ...]) -> Rule:
+def specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
     """Return the machine code of `dispatcher` for the types of `arguments`, compiling it where the cache has none.
 
     It skips the dispatcher's look at the types of each argument, which would cost more than an episode's arithmetic;
-    the caller therefore passes the same types every time.
+    the caller therefore passes the same types every time. `what` is compiled, it says where it has to be.
 
     Raises
     ------
@@ -209,7 +225,7 @@ def specialise(dispatcher: Any, arguments: tuple[Any, ...]) -> Rule:
         folder = Path(dispatcher.py_func.__code__.co_filename).parent
         if not any(folder.glob("__pycache__/*.nbc")):
             for tell in on_compile:
-                tell("compiling the episode for this system and learner: some seconds, once")
+                tell(f"compiling {what}: some seconds, once")
         try:
             dispatcher.compile(signature)
         except numba.core.errors.NumbaError as error:

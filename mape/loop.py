@@ -24,6 +24,7 @@ from mape.monitor import Monitor
 from mape.parts import make
 from mape.plan import Plan
 from mape.ports import ManagedSystem
+from mape.stretch.stretches import Stretches, obstacles
 from mape.swap import Component, owner, replace_part
 
 Send = Callable[[Any], object]
@@ -128,6 +129,8 @@ class Loop:
         self.bus.subscribe(Symptom, self.analyze.on_symptom)
         self.bus.subscribe(ChangeRequest, self.plan.on_request)
         self.bus.subscribe(ChangePlan, self.execute.adopt)
+        self._own_subscriptions = self.bus.subscriptions
+        self._stretches: Stretches | None = None
         self._swaps = deque(config.swap)  # those that are still to be made
         self._told: list[Callable[[SwapConfig, bool], object]] = []
 
@@ -179,9 +182,41 @@ class Loop:
         while execute.passes < last:
             self._swap_before(execute.passes + 1)
             until = min(last, self._swaps[0].pass_no - 1) if self._swaps else last
-            for _ in range(execute.passes, until):
-                drive()
+            stretches = self.stretches()
+            while execute.passes < until:
+                if stretches is None or not stretches.run(until):
+                    drive()
                 settle()
+
+    def stretches(self) -> Stretches | None:
+        """Compile the quiet passes of this loop, and return them; None where something keeps it from that.
+
+        Raises
+        ------
+        ConfigError
+            A rule cannot be compiled; or the engine is 'compiled', and a part declares no rule.
+        """
+        if self._stretches is not None and self._stretches.fit:
+            return self._stretches
+        ready = not self.obstacles()
+        self._stretches = (
+            Stretches(self.execute, self.monitor, self.analyze, self.plan, self.knowledge) if ready else None
+        )
+        return self._stretches
+
+    def obstacles(self) -> list[str]:
+        """Return what keeps the quiet passes of this loop from being compiled, a clause for each."""
+        if self.config.execute.engine == "python":
+            return ["the engine is python"]
+        found = obstacles(self.execute, self.monitor, self.analyze, self.plan)
+        if found and self.config.execute.engine == "compiled":
+            raise ConfigError(
+                f"engine 'compiled' needs rules that can be compiled, and {'; '.join(found)}. Choose 'auto', which "
+                "compiles what it can, or 'python'."
+            )
+        if self.bus.subscriptions > self._own_subscriptions:
+            found.append("somebody listens to each record")
+        return found
 
     def _swap_before(self, number: int) -> None:
         while self._swaps and self._swaps[0].pass_no <= number:

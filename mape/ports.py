@@ -2,9 +2,13 @@
 
 A part is any object with these members; nothing is inherited. `mape.testing` checks them.
 
-A detector, analyzer, schedule or planner may also have `state_format`, a name such as ``"page_hinkley/1"`` of what its
-`state` gives: a part that takes its place in a running loop and has the same one takes over its state. A planner that
-keeps its schedule in an attribute `schedule`, and asks it anew at each plan, can be given another one.
+A detector, analyzer, schedule or planner may also have
+
+- `state_format`, a name such as ``"page_hinkley/1"`` of what its `state` gives: a part that takes its place in a
+  running loop and has the same one takes over its state. A planner that keeps its schedule in an attribute `schedule`,
+  and asks it anew at each plan, can be given another one;
+- `quiet`, a `QuietRule`: where all parts declare one, and the system offers its rules, a stretch of passes in which
+  nothing changes is one compiled call (`mape.stretch`).
 """
 
 from __future__ import annotations
@@ -20,6 +24,33 @@ from knowledge.records import Direction
 
 Json = Any
 """What the standard library's JSON writes: None, bool, int, float, str, list, dict."""
+
+
+class QuietRule(NamedTuple):
+    """What a part does in a quiet pass: no alarm, and the actions on offer are those of the Q-table.
+
+    Attributes
+    ----------
+    function : the rule, pure but for `state`, which it changes in place. Plain Python that Numba can compile: a
+        module-level function, or a `mape.compose.Composed`. By the kind of the part:
+
+        - detector: ``(state, params, x) -> (alarm, statistic, direction)``, the statistic NaN for none, the direction
+          a code of `knowledge.rows.DIRECTIONS`. The part's `update` does the same;
+        - analyzer: ``(state, params, signals) -> changed``: whether it would ask for a change although no detector
+          alarms and the sets of actions are equal;
+        - planner: ``(state, params, signals) -> epsilon``: the exploration rate of its answer to a request in which
+          nothing changed, which repeats the learning rate of the plan before and asks for nothing else;
+        - schedule: ``(state, params, episode_return) -> epsilon``: its `advance`, and the `epsilon` after it.
+
+        `signals` are the signals of the pass in the order of the run, from the return on.
+    state : the numbers that the part carries, live: a list that its own methods work on, and that is written anew after
+        a compiled stretch. The function gets it, or a float64 array of the same numbers.
+    params : its fixed numbers.
+    """
+
+    function: Any
+    state: list[float]
+    params: tuple[float, ...] = ()
 
 
 class Detector(Protocol):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from knowledge import ChangeRequest, Drift, Symptom
+from mape.ports import QuietRule
 from mape.specs import PartConfig
 
 _new = tuple.__new__
@@ -18,11 +19,17 @@ class ChangesConfig(PartConfig):
     """Options of `Changes`: none."""
 
 
+def nothing(state: list[float], params: tuple[float, ...], signals: Any) -> bool:
+    """Say that nothing changed, where no detector alarms and the sets of actions are equal."""
+    return False
+
+
 class Changes:
     """Every alarm is a drift; where two detectors watch one signal, the first that alarms names the direction."""
 
     Config = ChangesConfig
     state_format = "changes/1"
+    quiet = QuietRule(nothing, [])  # there is no state to be shared
 
     def __init__(self, config: ChangesConfig) -> None:
         self.config = config

@@ -18,13 +18,22 @@ Driver = Callable[..., tuple[int, int, float, float, float]]
 
 def by_rules(rules: StepRules, learner: Learner, arguments: tuple[Any, ...]) -> Driver:
     """Return the episode as one compiled call, for the types of `arguments`."""
-    six = (rules.phase, rules.reset, rules.step, rules.explorable, learner.value, learner.step_size)
-    return specialise(_compiled(*six), arguments)
+    return specialise(_compiled(composed(rules, learner)), arguments, "the episode of this system and learner")
+
+
+def composed(rules: StepRules, learner: Learner) -> Composed:
+    """Return the episode with its names bound to the rules of a system and a learner; equal ones are one object."""
+    return _composed(rules.phase, rules.reset, rules.step, rules.explorable, learner.value, learner.step_size)
 
 
 @functools.cache
-def _compiled(phase: Rule, reset: Rule, step: Rule, explorable: Rule, value: Rule, step_size: Rule) -> Any:
+def _compiled(bound: Composed) -> Any:
     # Once per process: reading the sources for their hash costs as much as hundreds of episodes.
+    return bound.compiled()
+
+
+@functools.cache
+def _composed(phase: Rule, reset: Rule, step: Rule, explorable: Rule, value: Rule, step_size: Rule) -> Composed:
     begin = Composed(drive.begin_by_rules, {"phase_rule": phase, "reset_rule": reset})
     act = Composed(drive.act_by_rules, {"step_rule": step})
     bound: Bindings = {
@@ -34,7 +43,7 @@ def _compiled(phase: Rule, reset: Rule, step: Rule, explorable: Rule, value: Rul
         "value": value,
         "step_size": step_size,
     }
-    return Composed(episode.episode, bound).compiled()
+    return Composed(episode.episode, bound, apart=True)
 
 
 def by_calls(learner: Learner) -> Driver:

@@ -82,26 +82,26 @@ class Execute:
                 f"engine 'compiled' needs a system that offers its rules; {system.name} does not. Choose 'auto' or "
                 "'python'."
             )
-        self._rules = None if engine == "python" else system.rules
+        self.rules = None if engine == "python" else system.rules
         reset_draws, step_draws = system.draws
         cap = system.max_steps
         self._system_draws = reset_draws + cap * step_draws
-        self._uniforms = Uniforms(seed, (loop, trial), self._system_draws + 2 * cap)
+        self.uniforms = Uniforms(seed, (loop, trial), self._system_draws + 2 * cap)
 
         self._workspace = Workspace(cap)
         self._context = np.zeros(len(system.signal_names))
         self._no_trace = np.empty((0, len(episode.TRACE_COLUMNS)))
         self._limits = (mask_greedy, reset_draws, step_draws, cap)
         self._called = drive.Called(system)
-        self._target: Any = self._called if self._rules is None else self._rules.params
-        self._available: tuple[int, ...] = ()
+        self._target: Any = self._called if self.rules is None else self.rules.params
+        self.available: tuple[int, ...] = ()
         self._enabled: tuple[int, ...] = ()  # by all plans so far
         self._rate = rate_array((0.0,) * len(learner.rate_names))
 
         self._begun = 0  # the episode whose reset has been done ahead of its drive
         first = system.available(1)
         if first is None:  # only a reset can tell; episode 1 then goes on from it
-            first = self._begin(1, self._uniforms.find(0))
+            first = self._begin(1, self.uniforms.find(0))
             self._begun = 1
         self._take_actions(first, 1)
         self._set_table(QTable(first, system.n_states))
@@ -132,7 +132,7 @@ class Execute:
         if changed:
             rates = adoption.checked_rate(plan, self.learner)
         if add or drop or enable or adopt is not None:
-            table = adoption.table_after(plan, self.q_table, self._available, self.system, self._knowledge)
+            table = adoption.table_after(plan, self.q_table, self.available, self.system, self._knowledge)
             if enable:
                 self._enable(plan)
             self._set_table(table)
@@ -155,15 +155,15 @@ class Execute:
         if plan is None:
             raise PartError("no plan is in force; plan 0 starts a run")
         number = self.passes + 1
-        at = self._uniforms.find(self.passes)
+        at = self.uniforms.find(self.passes)
 
-        available = self.system.available(number) if self._rules is not None else None
+        available = self.system.available(number) if self.rules is not None else None
         if available is None:
             if self._begun == number:
-                available, self._begun = self._available, 0
+                available, self._begun = self.available, 0
             else:
                 available = self._begin(number, at)
-        if available is not self._available:
+        if available is not self.available:
             self._take_actions(available, number)
             self._set_rows()
         tracing = number in self._traced
@@ -185,30 +185,66 @@ class Execute:
         signals = {"return": total, "steps": float(steps), "td_error": td_error, "q_change": change}
         if self._own_signals:
             self._add_own_signals(signals, number)
-        self.passes = number
         if tracing and self.trace is not None:
             self.trace(number, trace[:steps])
+        self.observe(steps, signals)
+
+    def observe(self, steps: int, signals: dict[str, float]) -> None:
+        """Send the Observation of the next pass, whose episode is driven."""
+        plan = self.plan
+        assert plan is not None
+        self.passes += 1
         self._send(
             _new(
                 Observation,
                 (
                     self._loop,
-                    number,
+                    self.passes,
                     plan.pass_no,
                     plan.epsilon,
                     plan.reset_detector,
                     steps,
-                    available,
+                    self.available,
                     self.q_table.actions,
                     signals,
                 ),
             )
         )
 
+    def quiet_until(self, last: int) -> int:
+        """Return the pass, `last` at most, up to which all episodes are alike.
+
+        They offer the same actions, which are those of the Q-table; none is traced, and the plan in force asks for
+        nothing else than to explore. Where not even the next one is such, the passes that are finished.
+        """
+        plan, number = self.plan, self.passes + 1
+        if self.rules is None or plan is None or plan.reset_detector or number in self._traced:
+            return self.passes
+        available = self.system.available(number)
+        if available is not self.available or set(self.available) != set(self.q_table.actions):
+            return self.passes
+        first, end = self.rules.windows.T
+        edges: list[int] = [*(first - 1).tolist(), *end.tolist(), self._traced.start - 1]
+        return min(last, *(edge for edge in edges if edge >= number))
+
+    def follow(self, plan: ChangePlan) -> None:
+        """Take the passes up to that of `plan` for made: `drive` was called in its place, with the same arguments."""
+        self.plan = plan
+        self.passes = plan.pass_no
+
+    def roll_back(self) -> None:
+        """Make the Q-table what it was before the last episode."""
+        self._workspace.roll_back()
+
     @property
     def compiled(self) -> bool:
         """Whether an episode is one compiled call."""
-        return self._rules is not None
+        return self.rules is not None
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """What an episode takes after its number, epsilon, and the place of its draws, where it is not traced."""
+        return (self._no_trace, *self._fixed)
 
     def state(self) -> tuple[Json, QTable]:
         """Return what a fresh Execute needs to go on from here: plain JSON, and a copy of the Q-table.
@@ -221,7 +257,7 @@ class Execute:
             The system raised when it was asked for what it carries.
         """
         carried = carried_by(self.system)
-        at = Checkpoint(self.passes, self.plan, self._available, self._enabled, carried)
+        at = Checkpoint(self.passes, self.plan, self.available, self._enabled, carried)
         return at.as_json(), self.q_table.copy()
 
     def restore(self, state: Json, table: QTable) -> None:
@@ -266,9 +302,9 @@ class Execute:
         self._fix_arguments()
 
     def _bound(self, learner: Learner) -> binding.Driver:
-        if self._rules is None:
+        if self.rules is None:
             return binding.by_calls(learner)
-        return binding.by_rules(self._rules, learner, (1, 0.5, 0, self._no_trace, *self._arguments(learner)))
+        return binding.by_rules(self.rules, learner, (1, 0.5, 0, self._no_trace, *self._arguments(learner)))
 
     def _fix_arguments(self) -> None:
         self._fixed = self._arguments(self.learner)
@@ -279,7 +315,7 @@ class Execute:
             self._target,
             *self._workspace.arguments,
             self._rate,
-            self._uniforms.values,
+            self.uniforms.values,
             self._context,
             learner.discount,
             learner.bootstrap_terminal,
@@ -289,7 +325,7 @@ class Execute:
     def _begin(self, number: int, at: int) -> tuple[int, ...]:
         seed, *key = self._seeds
         sequence = np.random.SeedSequence(entropy=seed, spawn_key=(*key, number))
-        block = self._uniforms.values[at : at + self._system_draws]
+        block = self.uniforms.values[at : at + self._system_draws]
         told = Episode(number, int(sequence.generate_state(1)[0]), block)
         try:
             self._called.state, available = self.system.begin(told)
@@ -301,11 +337,11 @@ class Execute:
                 f"{self.passes} passes before it stand in the log."
             ) from error
         # One object as long as nothing changes: what compares by identity is cheap downstream.
-        return self._available if available == self._available else available
+        return self.available if available == self.available else available
 
     def _take_actions(self, available: tuple[int, ...], number: int) -> None:
         check_offer(available, self.system, number, self._max_actions)
-        self._available = available
+        self.available = available
 
     def _add_own_signals(self, signals: dict[str, float], number: int) -> None:
         for name, value in zip(self._own_signals, self._context.tolist(), strict=True):
@@ -324,9 +360,9 @@ class Execute:
         self._set_rows()
 
     def _set_rows(self) -> None:
-        if not self._workspace.offer(self._available):
+        if not self._workspace.offer(self.available):
             raise ManagedSystemError(
-                f"{self.system.name} offers actions {self._available}, of which the Q-table knows none: it has "
+                f"{self.system.name} offers actions {self.available}, of which the Q-table knows none: it has "
                 f"{self.q_table.actions}. A new action is first tried in the episode after the one that reports it, so "
                 "at least one known action must stay."
             )
@@ -337,4 +373,4 @@ class Execute:
         self._enabled += tuple(action for action in plan.enable if action not in self._enabled)
         after = self.system.available(self.passes + 1)
         if after is not None:
-            self._available = after
+            self.available = after

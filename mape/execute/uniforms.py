@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-DRAWS_AT_ONCE = 8192
-"""Uniforms drawn in one go: cheaper per pass, and the same stream."""
+PASSES_AT_ONCE, DRAWS_AT_ONCE = 512, 65_536
+"""Blocks drawn in one go, and how many uniforms they are at most: cheaper per pass, and the same stream."""
 
 
 class Uniforms:
@@ -20,7 +20,9 @@ class Uniforms:
 
     Attributes
     ----------
-    values : float64 array; the same object for good, filled anew when a pass is asked for whose block is not in it.
+    values : float64 array, of the blocks of passes that follow one another; the same object for good, filled anew when
+        a pass is asked for whose block is not in it.
+    width : uniforms per pass.
 
     Examples
     --------
@@ -32,8 +34,8 @@ class Uniforms:
     """
 
     def __init__(self, seed: int, key: tuple[int, ...], width: int) -> None:
-        self._width = width
-        self._held = max(1, DRAWS_AT_ONCE // width)  # passes whose blocks are held together
+        self.width = width
+        self._held = max(1, min(PASSES_AT_ONCE, DRAWS_AT_ONCE // width))  # passes whose blocks are held together
         self._bits = np.random.PCG64(np.random.SeedSequence(entropy=seed, spawn_key=key))
         self._generator = np.random.Generator(self._bits)
         self.values = np.empty(self._held * width)
@@ -47,7 +49,7 @@ class Uniforms:
             turn = passes % self._held
             self._first = passes - turn
             if self._first != self._next:
-                self._bits.advance((self._first - self._next) * self._width)  # a double takes one draw
+                self._bits.advance((self._first - self._next) * self.width)  # a double takes one draw
             self._generator.random(out=self.values)
             self._next = self._first + self._held
-        return turn * self._width
+        return turn * self.width

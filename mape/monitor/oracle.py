@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from pydantic import field_validator
 
 from knowledge.records import Direction
+from knowledge.rows import UNKNOWN
+from mape.ports import QuietRule
 from mape.specs import PartConfig
 
 
@@ -21,6 +24,15 @@ class OracleConfig(PartConfig):
         if any(e < 1 for e in episodes) or list(episodes) != sorted(set(episodes)):
             raise ValueError(f"episodes {list(episodes)} must be increasing and at least 1")
         return episodes
+
+
+def oracle_alarm(state: list[float], params: tuple[float, ...], x: float) -> tuple[bool, float, int]:
+    """Count one episode on state = (episodes seen,); params are the episodes that are told, increasing."""
+    state[0] += 1.0
+    told = False
+    for episode in params:
+        told = told or episode == state[0]
+    return told, math.nan, UNKNOWN
 
 
 class Oracle:
@@ -42,21 +54,25 @@ class Oracle:
 
     def __init__(self, config: OracleConfig) -> None:
         self.config = config
-        self._told = frozenset(config.episodes)
-        self._episode = 0
+        self._state = [0.0]
+        self._params = tuple(float(episode) for episode in config.episodes)
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `update`, over this one's numbers."""
+        return QuietRule(oracle_alarm, self._state, self._params)
 
     def update(self, x: float) -> bool:
         """Count one episode; say whether it is a named one."""
-        self._episode += 1
-        return self._episode in self._told
+        return oracle_alarm(self._state, self._params, x)[0]
 
     def reset(self) -> None:
         """Do nothing: the count of the episodes is no evidence to be forgotten."""
 
     def state(self) -> int:
         """Return the number of episodes seen."""
-        return self._episode
+        return int(self._state[0])
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
-        self._episode = int(state)
+        self._state[0] = float(int(state))

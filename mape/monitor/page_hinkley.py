@@ -19,7 +19,11 @@ from typing import Any
 from pydantic import Field
 
 from knowledge.records import Direction
+from knowledge.rows import DOWN
+from mape.ports import QuietRule
 from mape.specs import PartConfig
+
+_NUMBERS = ("n", "mean", "total", "minimum")
 
 
 class PageHinkleyConfig(PartConfig):
@@ -39,6 +43,17 @@ def page_hinkley(
     return n, mean, total, total if total < minimum else minimum
 
 
+def page_hinkley_alarm(state: list[float], params: tuple[float, ...], x: float) -> tuple[bool, float, int]:
+    """Take one step on state = (n, mean, total, minimum), with params = (delta, threshold)."""
+    n, mean, total, minimum = page_hinkley(x, state[0], state[1], state[2], state[3], params[0])
+    state[0] = n
+    state[1] = mean
+    state[2] = total
+    state[3] = minimum
+    statistic = total - minimum
+    return statistic > params[1], statistic, DOWN
+
+
 class PageHinkley:
     """Page-Hinkley test on one signal.
 
@@ -55,33 +70,34 @@ class PageHinkley:
 
     def __init__(self, config: PageHinkleyConfig) -> None:
         self.config = config
-        self._delta = config.delta
-        self._threshold = config.threshold
-        self._n = self._mean = self._total = self._minimum = 0.0
+        self._state = [0.0] * 4
+        self._params = (config.delta, config.threshold)
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `update`, over this one's numbers."""
+        return QuietRule(page_hinkley_alarm, self._state, self._params)
 
     @property
     def statistic(self) -> float:
         """How far the cumulative sum stands above its minimum."""
-        return self._total - self._minimum
+        return self._state[2] - self._state[3]
 
     def update(self, x: float) -> bool:
         """Take one value; say whether the test alarms."""
-        self._n, self._mean, self._total, self._minimum = page_hinkley(
-            x, self._n, self._mean, self._total, self._minimum, self._delta
-        )
-        return self._total - self._minimum > self._threshold
+        return page_hinkley_alarm(self._state, self._params, x)[0]
 
     def reset(self) -> None:
         """Forget everything."""
-        self._n = self._mean = self._total = self._minimum = 0.0
+        self._state[:] = (0.0,) * 4
 
     def state(self) -> dict[str, float]:
         """Return the four numbers of the test."""
-        return {"n": self._n, "mean": self._mean, "total": self._total, "minimum": self._minimum}
+        return dict(zip(_NUMBERS, self._state, strict=True))
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
-        numbers = [float(state[key]) for key in ("n", "mean", "total", "minimum")]
+        numbers = [float(state[key]) for key in _NUMBERS]
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError(f"state {state} of a Page-Hinkley test must be finite")
-        self._n, self._mean, self._total, self._minimum = numbers
+        self._state[:] = numbers

@@ -10,12 +10,13 @@ two-sample z-test over sliding windows (Kifer, Ben-David & Gehrke, VLDB 2004).
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Any
 
 from pydantic import Field
 
 from knowledge.records import Direction
+from knowledge.rows import DIRECTIONS, DOWN, UNKNOWN, UP
+from mape.ports import QuietRule
 from mape.specs import PartConfig
 
 
@@ -40,6 +41,44 @@ def two_window_z(
     return (mean_new - mean_old) / spread
 
 
+def two_window_alarm(state: list[float], params: tuple[float, ...], x: float) -> tuple[bool, float, int]:
+    """Take one value; params = (reference, recent, threshold).
+
+    state = (z, number of values taken, the newest of them): the values stand in a ring, number k in place k modulo its
+    length. z is NaN before the windows are full.
+    """
+    reference = int(params[0])
+    recent = int(params[1])
+    length = reference + recent
+    taken = int(state[1])
+    state[2 + taken % length] = x
+    taken += 1
+    state[1] = taken
+    if taken < length:
+        return False, math.nan, UNKNOWN
+    # Sums are taken relative to the oldest value: squares of large offsets would cancel.
+    origin = state[2 + taken % length]
+    sum_old = squares_old = sum_new = squares_new = 0.0
+    for k in range(taken, taken + reference):
+        value = state[2 + k % length] - origin
+        sum_old += value
+        squares_old += value * value
+    for k in range(taken + reference, taken + length):
+        value = state[2 + k % length] - origin
+        sum_new += value
+        squares_new += value * value
+    z = two_window_z(float(reference), sum_old, squares_old, float(recent), sum_new, squares_new)
+    state[0] = z
+    return abs(z) > params[2], abs(z), side(z)
+
+
+def side(z: float) -> int:
+    """Return the code of the side to which the mean moved."""
+    if z > 0.0:
+        return UP
+    return DOWN if z < 0.0 else UNKNOWN
+
+
 class TwoWindow:
     """Two adjacent sliding windows over one signal.
 
@@ -55,42 +94,48 @@ class TwoWindow:
 
     def __init__(self, config: TwoWindowConfig) -> None:
         self.config = config
-        self._z: float | None = None
+        self._length = config.reference + config.recent
+        self._state = [0.0] * (2 + self._length)
+        self._params = (float(config.reference), float(config.recent), config.threshold)
         self.reset()
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `update`, over this one's numbers."""
+        return QuietRule(two_window_alarm, self._state, self._params)
 
     @property
     def direction(self) -> Direction:
         """Side to which the mean moved, by the last z."""
-        return "unknown" if not self._z else "up" if self._z > 0 else "down"
+        return _SIDES[side(self._state[0])]
 
     @property
     def statistic(self) -> float | None:
         """The last |z|, or None before the windows are full."""
-        return None if self._z is None else abs(self._z)
+        z = self._state[0]
+        return None if math.isnan(z) else abs(z)
 
     def update(self, x: float) -> bool:
         """Take one value; say whether the test alarms."""
-        self._values.append(x)
-        if len(self._values) < self.config.reference + self.config.recent:
-            return False
-        values = list(self._values)
-        # Sums are taken relative to one value of the window: squares of large offsets would cancel.
-        old = [v - values[0] for v in values[: self.config.reference]]
-        new = [v - values[0] for v in values[self.config.reference :]]
-        self._z = two_window_z(len(old), sum(old), sum(v * v for v in old), len(new), sum(new), sum(v * v for v in new))
-        return abs(self._z) > self.config.threshold
+        return two_window_alarm(self._state, self._params, x)[0]
 
     def reset(self) -> None:
         """Forget everything."""
-        self._values: deque[float] = deque(maxlen=self.config.reference + self.config.recent)
-        self._z = None
+        self._state[:2] = (math.nan, 0.0)
 
     def state(self) -> dict[str, Any]:
-        """Return the values in the windows and the last z."""
-        return {"values": list(self._values), "z": self._z}
+        """Return the values in the windows, oldest first, and the last z."""
+        taken = int(self._state[1])
+        first = max(0, taken - self._length)
+        values = [self._state[2 + k % self._length] for k in range(first, taken)]
+        z = self._state[0]
+        return {"values": values, "z": None if math.isnan(z) else z}
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
-        self.reset()
-        self._values.extend(float(v) for v in state["values"])
-        self._z = state["z"]
+        values = [float(v) for v in state["values"]][-self._length :]
+        z = math.nan if state["z"] is None else float(state["z"])
+        self._state[: 2 + len(values)] = [z, float(len(values)), *values]
+
+
+_SIDES: dict[int, Direction] = {code: name for name, code in DIRECTIONS.items()}

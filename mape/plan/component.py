@@ -27,6 +27,7 @@ class Plan:
 
     def __init__(self, planner: Planner, knowledge: Knowledge, send: Callable[[ChangePlan], object]) -> None:
         self.planner = planner
+        self.answered = False  # whether the newest plan is of the planner that is here now
         self.schedule_spec: PartSpec | None = None  # of the schedule that took the place of the config's, if one did
         self._knowledge = knowledge
         self._send = send
@@ -36,6 +37,7 @@ class Plan:
         """Send plan 0, which starts the run, and return it."""
         plan = self._started(loop)
         self._knowledge.plan = plan
+        self.answered = True
         self._send(plan)
         return plan
 
@@ -53,7 +55,12 @@ class Plan:
             raise self._failed(request.pass_no, error) from error
         self._check(plan, request.pass_no)
         self._knowledge.plan = plan
+        self.answered = True
         self._send(plan)
+
+    def follow(self, plan: ChangePlan) -> None:
+        """Take `plan` for sent: the planner's rule was called in its place."""
+        self._knowledge.plan = plan
 
     def state(self) -> Json:
         """Return the planner's state, its schedule's in it: all that is carried from pass to pass.
@@ -94,7 +101,9 @@ class Plan:
         old, self.planner = self.planner, planner
         try:
             self._started(self._knowledge.log.loop)
-            return hand_over("planner", old, planner)
+            handed_over = hand_over("planner", old, planner)
+            self.answered = False
+            return handed_over
         except BaseException:
             self.planner = old
             raise

@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
+from mape.ports import QuietRule
 from mape.specs import PartConfig
 
 
@@ -13,6 +14,11 @@ class ConstantConfig(PartConfig):
     """Options of `Constant`."""
 
     epsilon: float = Field(0.1, ge=0, le=1, description="exploration rate of every episode")
+
+
+def constant(state: list[float], params: tuple[float, ...], episode_return: float) -> float:
+    """Return the exploration rate, params = (epsilon,)."""
+    return params[0]
 
 
 class Constant:
@@ -24,6 +30,11 @@ class Constant:
     def __init__(self, config: ConstantConfig) -> None:
         self.config = config
         self.epsilon = config.epsilon
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `advance`, which returns the rate."""
+        return QuietRule(constant, [], (self.config.epsilon,))
 
     def advance(self, episode_return: float) -> None:
         """Do nothing."""

@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import Field
 
+from mape.ports import QuietRule
 from mape.specs import PartConfig
 
 
@@ -31,6 +32,12 @@ def exponential(counter: float, eps_min: float, decay: float) -> float:
     return eps_min + (1.0 - eps_min) * math.exp(-decay * counter)
 
 
+def exponential_next(state: list[float], params: tuple[float, ...], episode_return: float) -> float:
+    """Count one episode on state = (counter,), and return the exploration rate; params = (eps_min, decay)."""
+    state[0] += 1.0
+    return exponential(state[0], params[0], params[1])
+
+
 class Exponential:
     """Exponential schedule over a counter of episodes."""
 
@@ -39,27 +46,31 @@ class Exponential:
 
     def __init__(self, config: ExponentialConfig) -> None:
         self.config = config
-        self._eps_min = config.eps_min
-        self._decay = config.decay
-        self._counter = 0.0
+        self._state = [0.0]
+        self._params: tuple[float, ...] = (config.eps_min, config.decay)
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `advance`, over this one's numbers."""
+        return QuietRule(exponential_next, self._state, self._params)
 
     @property
     def epsilon(self) -> float:
         """Exploration rate of the next episode."""
-        return exponential(self._counter, self._eps_min, self._decay)
+        return exponential(self._state[0], self.config.eps_min, self.config.decay)
 
     def advance(self, episode_return: float) -> None:
         """Count one episode without a response."""
-        self._counter += 1.0
+        exponential_next(self._state, self._params, episode_return)
 
     def reset(self) -> None:
         """Explore anew."""
-        self._counter = 0.0
+        self._state[0] = 0.0
 
     def state(self) -> Any:
         """Return the counter."""
-        return {"counter": self._counter}
+        return {"counter": self._state[0]}
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
-        self._counter = float(state["counter"])
+        self._state[0] = float(state["counter"])

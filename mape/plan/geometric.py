@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
+from mape.ports import QuietRule
 from mape.specs import PartConfig
 
 
@@ -25,6 +26,12 @@ def geometric(epsilon: float, eps_min: float, factor: float) -> float:
     return max(eps_min, factor * epsilon)
 
 
+def geometric_next(state: list[float], params: tuple[float, ...], episode_return: float) -> float:
+    """Take the step on state = (epsilon,), and return it; params = (eps_min, factor)."""
+    state[0] = geometric(state[0], params[0], params[1])
+    return state[0]
+
+
 class Geometric:
     """Geometric schedule."""
 
@@ -33,27 +40,31 @@ class Geometric:
 
     def __init__(self, config: GeometricConfig) -> None:
         self.config = config
-        self._eps_min = config.eps_min
-        self._factor = config.factor
-        self._epsilon = 1.0
+        self._state = [1.0]
+        self._params = (config.eps_min, config.factor)
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `advance`, over this one's numbers."""
+        return QuietRule(geometric_next, self._state, self._params)
 
     @property
     def epsilon(self) -> float:
         """Exploration rate of the next episode."""
-        return self._epsilon
+        return self._state[0]
 
     def advance(self, episode_return: float) -> None:
         """Count one episode without a response."""
-        self._epsilon = geometric(self._epsilon, self._eps_min, self._factor)
+        geometric_next(self._state, self._params, episode_return)
 
     def reset(self) -> None:
         """Explore anew."""
-        self._epsilon = 1.0
+        self._state[0] = 1.0
 
     def state(self) -> Any:
         """Return the exploration rate."""
-        return {"epsilon": self._epsilon}
+        return {"epsilon": self._state[0]}
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
-        self._epsilon = float(state["epsilon"])
+        self._state[0] = float(state["epsilon"])

@@ -15,9 +15,10 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge
-from mape.ports import Schedule
+from mape.ports import QuietRule, Schedule
 from mape.specs import PartConfig
 from mape.states import joint_format
+from mape.stretch.quiet import quiet_by
 
 _new = tuple.__new__
 
@@ -69,6 +70,11 @@ class Morphin:
     def state_format(self) -> str | None:
         """Name of what `state` gives, which holds the schedule's."""
         return joint_format("morphin/1", self.schedule)
+
+    @property
+    def quiet(self) -> QuietRule | None:
+        """Nothing changed: the schedule goes on."""
+        return quiet_by(self.schedule)
 
     def start(self, loop: int) -> ChangePlan:
         """Return plan 0."""

@@ -10,9 +10,10 @@ from typing import Any
 from pydantic import Field
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge
-from mape.ports import Schedule
+from mape.ports import QuietRule, Schedule
 from mape.specs import PartConfig
 from mape.states import joint_format
+from mape.stretch.quiet import quiet_by
 
 
 class QLearningPlannerConfig(PartConfig):
@@ -36,6 +37,11 @@ class QLearningPlanner:
     def state_format(self) -> str | None:
         """Name of what `state` gives, which holds the schedule's."""
         return joint_format("q_learning/1", self.schedule)
+
+    @property
+    def quiet(self) -> QuietRule | None:
+        """Nothing changed: the schedule goes on."""
+        return quiet_by(self.schedule)
 
     def start(self, loop: int) -> ChangePlan:
         """Return plan 0."""

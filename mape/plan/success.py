@@ -15,7 +15,8 @@ from typing import Any
 
 from pydantic import Field
 
-from mape.plan.exponential import Exponential, ExponentialConfig
+from mape.plan.exponential import Exponential, ExponentialConfig, exponential
+from mape.ports import QuietRule
 
 
 class SuccessConfig(ExponentialConfig):
@@ -39,6 +40,15 @@ def success_counter(
     return min((counter + 1.0) * factor, COUNTER_CAP)
 
 
+def success_next(state: list[float], params: tuple[float, ...], episode_return: float) -> float:
+    """Take the step on state = (counter, 1 after a response), and return the exploration rate.
+
+    params = (eps_min, decay, on_success, on_failure)
+    """
+    state[0] = success_counter(state[0], episode_return, state[1] > 0.0, params[2], params[3])
+    return exponential(state[0], params[0], params[1])
+
+
 class Success(Exponential):
     """Exponential schedule whose counter follows the success rule after the first response."""
 
@@ -47,26 +57,28 @@ class Success(Exponential):
 
     def __init__(self, config: SuccessConfig) -> None:
         super().__init__(config)
-        self._on_success = config.on_success
-        self._on_failure = config.on_failure
-        self._responded = False
+        self._state = [0.0, 0.0]
+        self._params = (*self._params, config.on_success, config.on_failure)
+
+    @property
+    def quiet(self) -> QuietRule:
+        """The rule of `advance`, over this one's numbers."""
+        return QuietRule(success_next, self._state, self._params)
 
     def advance(self, episode_return: float) -> None:
         """Count one episode without a response, by the success rule."""
-        self._counter = success_counter(
-            self._counter, episode_return, self._responded, self._on_success, self._on_failure
-        )
+        success_next(self._state, self._params, episode_return)
 
     def reset(self) -> None:
         """Explore anew; from the first response on the success rule holds."""
         super().reset()
-        self._responded = True
+        self._state[1] = 1.0
 
     def state(self) -> Any:
         """Return the counter and whether there has been a response."""
-        return {"counter": self._counter, "responded": self._responded}
+        return {"counter": self._state[0], "responded": self._state[1] > 0.0}
 
     def restore(self, state: Any) -> None:
         """Take up where `state` was given."""
         super().restore(state)
-        self._responded = bool(state["responded"])
+        self._state[1] = float(bool(state["responded"]))

@@ -77,7 +77,7 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
         learner = make()
         plain, compiled = inputs(learner), inputs(learner)
         np.errstate(all="ignore")(bound(learner).python())(*plain)
-        specialise(bound(learner).compiled(), compiled)(*compiled)
+        specialise(bound(learner).compiled(), compiled, "the rules of this learner")(*compiled)
         for name, at in (("value", 6), ("step_size", 7)):
             if (differ := np.flatnonzero(plain[at] != compiled[at])).size:
                 i = int(differ[0])

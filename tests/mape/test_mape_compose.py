@@ -25,7 +25,7 @@ from mape.compose import Composed, specialise
 
 compiled = event.RecordingListener()
 event.register("numba:compile", compiled)
-function = specialise(Composed(template, {"rule": rule}).compiled(), (3.0,))
+function = specialise(Composed(template, {"rule": rule}).compiled(), (3.0,), "it")
 print(json.dumps([function(3.0), len(compiled.buffer)]))
 """
 
@@ -105,7 +105,7 @@ def test_plain_and_compiled_give_the_same_bits(value):
 
     plain, compiled = inputs(), inputs()
     composed.python()(*plain)
-    specialise(composed.compiled(), compiled)(*compiled)
+    specialise(composed.compiled(), compiled, "it")(*compiled)
     assert plain[6].tobytes() == compiled[6].tobytes()
     assert plain[7].tobytes() == compiled[7].tobytes()
     assert len(set(plain[7].tolist())) > 400

@@ -113,11 +113,11 @@ def hinkley(**members):
 
 
 def keeps_its_minimum(self):
-    self._n = self._mean = self._total = 0.0
+    self._state[:3] = (0.0,) * 3
 
 
 def restores_half(self, state):
-    self._n, self._mean = state["n"], state["mean"]
+    self._state[:2] = state["n"], state["mean"]
 
 
 NUMBERS = itertools.count()
@@ -159,15 +159,15 @@ NUMBERS = itertools.count()
             "at step 0 two fresh ones give",
         ),
         (hinkley(statistic=property(lambda self: next(NUMBERS))), DETERMINISTIC, "share nothing between objects"),
-        (hinkley(state=lambda self: (self._n,)), PLAIN, "comes back from JSON as something else"),
-        (hinkley(state=lambda self: {1: self._n}), PLAIN, "text as keys"),
+        (hinkley(state=lambda self: (self._state[0],)), PLAIN, "comes back from JSON as something else"),
+        (hinkley(state=lambda self: {1: self._state[0]}), PLAIN, "text as keys"),
         (hinkley(state=lambda self: {"n": float("nan")}), PLAIN, "is no plain JSON"),
         (hinkley(state=lambda self: self), PLAIN, "is no plain JSON"),
         (hinkley(state=vars), PLAIN, "is no plain JSON"),
         (
             windowed(
                 update=lambda self, x: self.__dict__.setdefault("kept", []).append(x) or TwoWindow.update(self, x),
-                state=lambda self: {"values": self.__dict__.setdefault("kept", []), "z": self._z},
+                state=lambda self: {"values": self.__dict__.setdefault("kept", []), "z": TwoWindow.state(self)["z"]},
             ),
             PLAIN,
             "state() returns a copy",
@@ -175,7 +175,7 @@ NUMBERS = itertools.count()
         (hinkley(restore=lambda self, state: None), TAKES_UP, "restored before step"),
         (hinkley(restore=restores_half), TAKES_UP, "restore() sets all of it"),
         (
-            windowed(restore=lambda self, state: self._values.extend(state["values"])),
+            windowed(restore=lambda self, state: [self.update(value) for value in state["values"]] and None),
             TAKES_UP,
             "a used one restored before step",
         ),
@@ -186,7 +186,11 @@ NUMBERS = itertools.count()
         ),
         (hinkley(reset=keeps_its_minimum), "forgets on reset the values that it has seen", "different values before"),
         (
-            windowed(reset=lambda self: TwoWindow.reset(self) if not hasattr(self, "_values") else self._values.pop()),
+            windowed(
+                reset=lambda self: (
+                    self._state.__setitem__(1, self._state[1] - 1) if self._state[1] else TwoWindow.reset(self)
+                )
+            ),
             "forgets on reset the values that it has seen",
             "after it",
         ),
@@ -268,16 +272,16 @@ def scheduled(**members):
         (scheduled(epsilon=1.5), "keeps epsilon in [0, 1]", "epsilon is 1.5"),
         (scheduled(epsilon=None), "keeps epsilon in [0, 1]", "epsilon is None"),
         (
-            scheduled(epsilon=property(lambda self: 1.0 - 0.1 * self._counter)),
+            scheduled(epsilon=property(lambda self: 1.0 - 0.1 * self._state[0])),
             "keeps epsilon in [0, 1]",
             "a number in [0, 1]",
         ),
         (scheduled(epsilon=property(lambda self: random.random())), DETERMINISTIC, "two fresh ones"),
-        (scheduled(state=lambda self: self._counter and float("inf")), PLAIN, "is no plain JSON"),
+        (scheduled(state=lambda self: self._state[0] and float("inf")), PLAIN, "is no plain JSON"),
         (scheduled(restore=lambda self, state: None), TAKES_UP, "restored before step"),
         (
             scheduled(
-                advance=lambda self, r: setattr(self, "_counter", self._counter + (r > 0)), reset=lambda self: None
+                advance=lambda self, r: self._state.__setitem__(0, self._state[0] + (r > 0)), reset=lambda self: None
             ),
             "starts anew on reset, whatever the returns before it",
             "reset() forgets what was counted",

@@ -1,0 +1,1 @@
+"""Stretches of quiet passes, each as one compiled call."""

@@ -1,0 +1,241 @@
+"""Makes the quiet passes of a loop in compiled stretches, between passes that the components make."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from knowledge import ChangePlan, ChangeRequest, Knowledge, Observation, Reading, Symptom
+from knowledge.log import Pass
+from knowledge.rows import DIRECTIONS, UNKNOWN
+from mape.analyze import Analyze
+from mape.compose import Composed, Rule, specialise
+from mape.execute import Execute
+from mape.execute.binding import composed
+from mape.monitor import Monitor
+from mape.plan import Plan
+from mape.ports import QuietRule
+from mape.stretch import passes
+from mape.stretch.quiet import obstacle, quiet_of
+
+_SIDES = {code: name for name, code in DIRECTIONS.items()}
+
+
+def obstacles(execute: Execute, monitor: Monitor, analyze: Analyze, plan: Plan) -> list[str]:
+    """Return what keeps these parts from quiet passes that are compiled, a clause for each; nothing where they can."""
+    found = [] if execute.compiled else [f"system {execute.system.name} offers no rules"]
+    watching = [(f"detector monitor.{k}", detector) for k, (_, detector) in enumerate(monitor.detectors)]
+    for kind, part in (*watching, ("analyzer", analyze.analyzer), ("planner", plan.planner)):
+        if (clause := obstacle(kind, part)) is not None:
+            found.append(clause)
+    return found
+
+
+class Stretches:
+    """The quiet passes of one loop.
+
+    Parameters
+    ----------
+    execute, monitor, analyze, plan
+        The components, whose parts all have a `QuietRule` (see `obstacles`).
+    knowledge
+        What they share.
+
+    Raises
+    ------
+    ConfigError
+        A rule cannot be compiled.
+    """
+
+    def __init__(self, execute: Execute, monitor: Monitor, analyze: Analyze, plan: Plan, knowledge: Knowledge) -> None:
+        self._execute = execute
+        self._monitor = monitor
+        self._analyze = analyze
+        self._plan = plan
+        self._log = knowledge.log
+        self._watched = tuple(name for name, _ in monitor.detectors)
+        self._parts = self._present()
+        rules = self._rules()
+        names = self._log.layout.signals
+        columns = [names.index(name) for name in self._watched]
+        self._at_values = [2 + column for column in columns]
+        self._bounds = _bounds(rules, columns)
+        self._state = np.zeros(max(1, int(self._bounds[-1, 1])))
+        self._before = np.zeros_like(self._state)
+        self._params = np.zeros(max(1, int(self._bounds[-1, 3])))
+        self._told = np.zeros(2, dtype=np.int64)
+        most = len(execute.uniforms.values) // execute.uniforms.width
+        self._numbers = np.zeros((most, 2 + len(names)))
+        self._statistics = np.full((most, len(self._watched)), math.nan)
+        self._directions = np.zeros((most, len(self._watched)), dtype=np.int64)
+        assert execute.rules is not None
+        dispatcher = _compiled(composed(execute.rules, execute.learner), *(rule.function for rule in rules))
+        self._passes = specialise(dispatcher, self._arguments(1, 1, 0.5, 0), "the passes of such a loop")
+
+    @property
+    def fit(self) -> bool:
+        """Whether the parts are still those for which these passes were compiled."""
+        return all(now is then for now, then in zip(self._present(), self._parts, strict=True))
+
+    def run(self, until: int) -> bool:
+        """Make passes up to number `until`, as long as they are quiet.
+
+        Returns
+        -------
+        Whether pass `until` is made, or the Observation of the next pass is sent, which is not quiet; else the next
+        pass is to be driven.
+        """
+        execute = self._execute
+        if not self._plan.answered:
+            return False  # what a planner repeats in a quiet pass, it has said at least once
+        while execute.passes < until:
+            count = execute.quiet_until(until) - execute.passes
+            if count < 1:
+                return False
+            at = execute.uniforms.find(execute.passes)
+            blocks = (len(execute.uniforms.values) - at) // execute.uniforms.width
+            status = self._make(min(count, blocks, self._log.room()), at)
+            if status == passes.BROKEN:
+                return False
+            if status == passes.HANDED_OVER:
+                numbers = self._numbers[int(self._told[passes.FINISHED]), 2:].tolist()
+                execute.observe(int(numbers[1]), dict(zip(self._log.layout.signals, numbers, strict=True)))
+                return True
+        return True
+
+    def _make(self, count: int, at: int) -> int:
+        """Make at most `count` passes, and log those that are finished; return what ended them."""
+        execute, first = self._execute, self._execute.passes + 1
+        plan = execute.plan
+        assert plan is not None
+        rules = self._rules()
+        self._state[: self._bounds[-1, 1]] = [number for rule in rules for number in rule.state]
+        self._params[: self._bounds[-1, 3]] = [number for rule in rules for number in rule.params]
+        try:
+            self._passes(*self._arguments(first, count, plan.epsilon, at))
+        except Exception:  # a rule raised: the components make this pass again, and say which
+            self._state[:] = self._before
+        status, finished = self._told.tolist()
+        if status == passes.BROKEN:
+            execute.roll_back()
+        numbers = self._state.tolist()
+        for rule, (begin, end) in zip(rules, self._bounds[:, :2].tolist(), strict=True):
+            rule.state[:] = numbers[begin:end]
+        if finished:
+            self._keep(first, finished, plan.learning_rate)
+        return int(status)
+
+    def _keep(self, first: int, count: int, rate: tuple[float, ...]) -> None:
+        execute, layout = self._execute, self._log.layout
+        newest = ChangePlan(
+            self._log.loop, first + count - 1, float(self._numbers[count - 1, 1]), rate, (), (), (), False, None
+        )
+        execute.follow(newest)
+        self._plan.follow(newest)
+        quiet = functools.partial(
+            _quiet_pass, self._log.loop, layout.signals, self._watched, execute.available, execute.q_table.actions, rate
+        )
+        numbers = self._numbers[:count]
+        rows = layout.repeat(quiet(first), count)
+        rows["pass"] = np.arange(first, first + count)
+        rows["plan"] = rows["pass"] - 1
+        rows["epsilon"] = numbers[:, 0]
+        rows["next_epsilon"] = numbers[:, 1]
+        rows["steps"] = numbers[:, 3]
+        rows["signals"] = numbers[:, 2:]
+        if self._watched:
+            rows["value"] = numbers[:, self._at_values]
+            statistics = self._statistics[:count]
+            rows["statistic"] = np.where(np.isnan(statistics), math.nan, statistics)  # of all that are NaN, one
+            rows["direction"] = self._directions[:count]
+        self._log.extend(rows, lambda row: quiet(*_of_row(row)))
+
+    def _present(self) -> tuple[Any, ...]:
+        planner, detectors = self._plan.planner, self._monitor.detectors
+        schedule = getattr(planner, "schedule", None)
+        return (planner, self._analyze.analyzer, *detectors, schedule, self._execute.learner)
+
+    def _rules(self) -> list[QuietRule]:
+        # Asked anew: a part may have put another list in the place of its numbers.
+        parts = (self._plan.planner, self._analyze.analyzer, *(detector for _, detector in self._monitor.detectors))
+        found = [quiet_of(part) for part in parts]
+        return [rule for rule in found if rule is not None]
+
+    def _arguments(self, first: int, count: int, epsilon: float, at: int) -> tuple[Any, ...]:
+        return (
+            first,
+            count,
+            epsilon,
+            at,
+            self._execute.uniforms.width,
+            self._told,
+            self._numbers,
+            self._statistics,
+            self._directions,
+            self._state,
+            self._before,
+            self._params,
+            self._bounds,
+            *self._execute.arguments,
+        )
+
+
+@functools.cache
+def _compiled(drive: Composed, explore: Rule, changed: Rule, *detectors: Rule) -> Any:
+    # Once per process: reading the sources for their hash costs as much as a trial.
+    sense: Any = passes.sense_none
+    for detector in reversed(detectors):
+        sense = Composed(passes.sense_each, {"detector": detector, "others": sense})
+    bound = {"drive": drive, "sense": sense, "changed": changed, "explore": explore}
+    return Composed(passes.passes, bound).compiled()
+
+
+def _bounds(rules: Sequence[QuietRule], columns: Sequence[int]) -> npt.NDArray[np.int64]:
+    """Say where each part's numbers stand; see `passes.passes`."""
+    bounds, state, params = [], 0, 0
+    for rule, column in zip(rules, (0, 0, *columns), strict=True):
+        bounds.append((state, state + len(rule.state), params, params + len(rule.params), column))
+        state, params = bounds[-1][1], bounds[-1][3]
+    return np.array(bounds, dtype=np.int64)
+
+
+def _quiet_pass(
+    loop: int,
+    names: tuple[str, ...],
+    watched: tuple[str, ...],
+    available: tuple[int, ...],
+    known: tuple[int, ...],
+    rate: tuple[float, ...],
+    number: int,
+    steps: int = 0,
+    epsilons: tuple[float, float] = (0.0, 0.0),
+    values: Sequence[float] = (),
+    statistics: Sequence[float] = (),
+    directions: Sequence[int] = (),
+) -> Pass:
+    """Return the four records of a quiet pass."""
+    signals = dict(zip(names, values or (0.0,) * len(names), strict=True))
+    readings = tuple(
+        Reading(name, signals[name], None if math.isnan(statistic) else statistic, False, _SIDES[side])
+        for name, statistic, side in zip(
+            watched, statistics or (0.0,) * len(watched), directions or (UNKNOWN,) * len(watched), strict=True
+        )
+    )
+    return Pass(
+        Observation(loop, number, number - 1, epsilons[0], False, steps, available, known, signals),
+        Symptom(loop, number, signals, available, known, readings),
+        ChangeRequest(loop, number, (), (), (), signals),
+        ChangePlan(loop, number, epsilons[1], rate, (), (), (), False, None),
+    )
+
+
+def _of_row(row: Any) -> tuple[Any, ...]:
+    """Return what a row of the log says of its own quiet pass."""
+    columns = ("signals", "statistic", "direction")
+    epsilons = (float(row["epsilon"]), float(row["next_epsilon"]))
+    return (int(row["pass"]), int(row["steps"]), epsilons, *(row[column].tolist() for column in columns))
