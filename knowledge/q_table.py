@@ -30,7 +30,8 @@ class QTable:
 
     Attributes
     ----------
-    values : float64 array, shape (actions, states), C-contiguous. A new array after each change of the rows.
+    values : float64 array, shape (actions, states), Fortran-contiguous: the values of a state stand together, as they
+        are looked at. A new array after each change of the rows.
 
     Examples
     --------
@@ -46,7 +47,7 @@ class QTable:
             raise ValueError(f"actions {self.actions} must be distinct and not negative")
         if n_states < 1:
             raise ValueError(f"n_states is {n_states}; a Q-table has at least one state")
-        self.values: npt.NDArray[np.float64] = np.zeros((len(self.actions), n_states))
+        self.values: npt.NDArray[np.float64] = np.zeros((len(self.actions), n_states), order="F")
 
     @property
     def n_states(self) -> int:
@@ -57,7 +58,7 @@ class QTable:
         """Append a row of zeros for each action that has none yet."""
         new = tuple(a for a in actions if a not in self.actions)
         if new:
-            self.values = np.concatenate([self.values, np.zeros((len(new), self.n_states))])
+            self.values = np.asfortranarray(np.concatenate([self.values, np.zeros((len(new), self.n_states))]))
             self.actions += new
 
     def drop(self, actions: Iterable[int]) -> None:
@@ -72,7 +73,7 @@ class QTable:
         if unknown := gone - set(self.actions):
             raise ValueError(f"actions {sorted(unknown)} have no row; the table knows {self.actions}")
         keep = [row for row, action in enumerate(self.actions) if action not in gone]
-        self.values = np.ascontiguousarray(self.values[keep])
+        self.values = np.asfortranarray(self.values[keep])
         self.actions = tuple(self.actions[row] for row in keep)
 
     def copy(self) -> QTable:

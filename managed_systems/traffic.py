@@ -19,6 +19,9 @@ from managed_systems.rules import ALWAYS, NEVER, FloatArray, IntArray, Rules, ph
 MAX_RATE = 700.0
 """Largest arrival rate, vehicles per step: beyond it exp(-rate) is no longer a normal float64."""
 
+GUIDES = 64
+"""Parts of [0, 1), for each of which it is tabulated where a search begins; a power of two, to be exact."""
+
 
 class TrafficParams(NamedTuple):
     """What the rules of a junction need.
@@ -26,8 +29,10 @@ class TrafficParams(NamedTuple):
     Attributes
     ----------
     services : int64 array, shape (actions, 2): vehicles that an action lets pass in lanes 1 and 2.
-    rates : float64 array, shape (phases, 2): mean arrivals per step in lanes 1 and 2.
-    switch_at : int64 array, shape (phases - 1,): episodes from which the next row of `rates` holds.
+    arrivals : float64 array, shape (phases, 2, n): for lanes 1 and 2 the `poisson_sums` of the arrivals per step,
+        and ones behind them.
+    guides : int64 array, shape (phases, 2, GUIDES): where in them to begin to look for a uniform, see `poisson`.
+    switch_at : int64 array, shape (phases - 1,): episodes from which the next phase holds.
     capacity : most vehicles in a lane.
     fewest, most : limits of a lane's queue at the start.
     long_queue : queue beyond which the longer lane counts twice.
@@ -35,7 +40,8 @@ class TrafficParams(NamedTuple):
     """
 
     services: IntArray
-    rates: FloatArray
+    arrivals: FloatArray
+    guides: IntArray
     switch_at: IntArray
     capacity: int
     fewest: int
@@ -44,13 +50,37 @@ class TrafficParams(NamedTuple):
     unused_penalty: float
 
 
-def poisson(rate: float, u: float) -> int:
-    """Turn a uniform into a Poisson number by inversion: the smallest k with u < P(X <= k).
+def poisson_sums(rate: float) -> list[float]:
+    """Return P(X <= k) of a Poisson number for k = 0, 1, ..., up to where the sum in floating point grows no more.
 
     Parameters
     ----------
     rate
         Mean, in ``0..MAX_RATE``.
+    """
+    k = 0
+    probability = below = math.exp(-rate)
+    sums = [below]
+    while True:
+        k += 1
+        probability *= rate / k
+        # The rounded sum may stop short of the largest uniform; past the mean, where the terms fall, it grows no more.
+        if below + probability == below and k > rate:
+            return sums
+        below += probability
+        sums.append(below)
+
+
+def poisson(sums: FloatArray, guide: IntArray, u: float) -> int:
+    """Turn a uniform into a Poisson number by inversion: the smallest k with u < P(X <= k).
+
+    Parameters
+    ----------
+    sums
+        What `poisson_sums` returns, and behind it any number of ones.
+    guide
+        Shape (GUIDES,): entry i is the number that the uniform i / GUIDES gives, from which the search begins (Chen &
+        Asau, Trans. Amer. Inst. Ind. Eng. 6, 1974).
     u
         Uniform in [0, 1).
 
@@ -58,20 +88,19 @@ def poisson(rate: float, u: float) -> int:
     --------
     P(X = 0) is exp(-2) = 0.1353..., and P(X <= 1) is 0.4060...:
 
-    >>> poisson(2.0, 0.1353), poisson(2.0, 0.1354), poisson(2.0, 0.41)
-    (0, 1, 2)
+    >>> sums = np.array([*poisson_sums(2.0), 1.0])
+    >>> [poisson(sums, guide_to(sums), u) for u in (0.1353, 0.1354, 0.41)]
+    [0, 1, 2]
     """
-    k = 0
-    probability = math.exp(-rate)
-    below = probability
-    while u >= below:
+    k = int(guide[int(u * GUIDES)])
+    while u >= sums[k]:
         k += 1
-        probability *= rate / k
-        # The rounded sum may stop short of the largest u; past the mean, where the terms fall, it will not grow again.
-        if below + probability == below and k > rate:
-            return k
-        below += probability
     return k
+
+
+def guide_to(sums: FloatArray) -> IntArray:
+    """Return the guide with which `poisson` searches `sums`; the last of them is 1."""
+    return np.searchsorted(sums, np.arange(GUIDES) / GUIDES, side="right")
 
 
 def reset(params: TrafficParams, phase: int, draws: FloatArray, at: int) -> int:
@@ -96,11 +125,11 @@ def step(
     service_2 = int(params.services[action, 1])
     unused = max(service_1 - lane_1, 0)
     lane_1 = max(lane_1 - service_1, 0)
-    arrivals_2 = poisson(float(params.rates[phase, 1]), float(draws[at]))
+    arrivals_2 = poisson(params.arrivals[phase, 1], params.guides[phase, 1], draws[at])
     lane_2 = min(lane_2 + arrivals_2, params.capacity)
     unused += max(service_2 - lane_2, 0)
     lane_2 = max(lane_2 - service_2, 0)
-    arrivals_1 = poisson(float(params.rates[phase, 0]), float(draws[at + 1]))
+    arrivals_1 = poisson(params.arrivals[phase, 0], params.guides[phase, 0], draws[at + 1])
     lane_1 = min(lane_1 + arrivals_1, params.capacity)
     context[0] += arrivals_1
     context[1] += arrivals_2
@@ -115,6 +144,13 @@ def step(
 def explorable(params: TrafficParams, phase: int, state: int, action: int) -> bool:
     """Every action is: its effect is random in every state."""
     return True
+
+
+def _arrivals(rates: Sequence[tuple[float, float]]) -> FloatArray:
+    """Tabulate the distribution of the arrivals of each phase and lane."""
+    sums = [[poisson_sums(rate) for rate in lanes] for lanes in rates]
+    longest = max(len(one) for lanes in sums for one in lanes) + 1
+    return np.array([[one + [1.0] * (longest - len(one)) for one in lanes] for lanes in sums])
 
 
 class TrafficJunction(RulesEnvironment[IntArray]):
@@ -200,11 +236,13 @@ class TrafficJunction(RulesEnvironment[IntArray]):
         self.long_queue = checks.whole("long_queue", long_queue, 0)
         self.unused_penalty = checks.real("unused_penalty", unused_penalty, 0.0)
         self._enabled: set[int] = set()
+        arrivals = _arrivals(self.rates)
         offered, held = len(self.services), len(self.reserve)
         rules = Rules(
             params=TrafficParams(
                 services=np.array(self.services + self.reserve, np.int64),
-                rates=np.array(self.rates, np.float64),
+                arrivals=arrivals,
+                guides=np.array([[guide_to(sums) for sums in lanes] for lanes in arrivals]),
                 switch_at=np.array(self.switch_at, np.int64),
                 capacity=self.capacity,
                 fewest=self.initial[0],

@@ -29,6 +29,8 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+import numpy as np
+
 from mape.errors import ConfigError
 
 Rule = Callable[..., Any]
@@ -218,6 +220,26 @@ def specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
     ConfigError
         Numba cannot compile a rule.
     """
+    key = (dispatcher, _kind(arguments))
+    if key not in _special:
+        _special[key] = _specialise(dispatcher, arguments, what)
+    return _special[key]
+
+
+_special: dict[tuple[Any, Any], Rule] = {}
+
+
+def _kind(argument: Any) -> Any:
+    """Return what fixes an argument's type in compiled code; Numba's own answer takes longer than many episodes."""
+    if isinstance(argument, tuple):
+        return (type(argument), *map(_kind, argument))
+    if isinstance(argument, np.ndarray):
+        flags = argument.flags
+        return argument.dtype, argument.ndim, flags.c_contiguous, flags.f_contiguous, flags.writeable, flags.aligned
+    return type(argument)
+
+
+def _specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
     import numba
 
     signature = tuple(numba.typeof(argument) for argument in arguments)  # type: ignore[no-untyped-call]

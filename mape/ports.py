@@ -97,8 +97,9 @@ class Planner(Protocol):
 class Learner(Protocol):
     """Two pure rules that Numba can compile, and the names of the learning-rate parameters that they take.
 
-    `value(q, rows, count, state, epsilon)` is the worth of a state, from which the TD target bootstraps, over the rows
-    ``rows[:count]`` of ``q``; `step_size(td_error, rate)` is the learning rate of one update.
+    `value(q, rows, count, state, best, epsilon)` is the worth of a state, from which the TD target bootstraps, over the
+    rows ``rows[:count]`` of ``q``, of which `best` is the first with the largest value; `step_size(td_error, rate)` is
+    the learning rate of one update.
     """
 
     rate_names: tuple[str, ...]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from adapters import detectors
 from adapters.results.files import read_json, read_npz, whole, write_json
 from adapters.results.table import DTYPE, from_rows, write_npz
-from adapters.systems import make_system
+from adapters.systems.lending import Lender
 from mape.config import from_table
 from mape.errors import MapekError, ResultsError
 from mape.execute.episode import TRACE_COLUMNS
@@ -62,7 +62,7 @@ def run_chunk(
     whole_units = digest.copy()
     failure: MapekError | None = None
     path = Path(stem)
-    with whole(path.with_suffix(".rows")) as file:
+    with whole(path.with_suffix(".rows")) as file, Lender() as lend:
         for unit in range(first, first + count):
             trial, turn = divmod(unit, config.loops)
 
@@ -84,7 +84,7 @@ def run_chunk(
                     prepare(loop)
 
             try:
-                results.append(run_trial(config, trial, make_system, loop=turn, on_rows=keep, prepare=ready))
+                results.append(run_trial(config, trial, lend, loop=turn, on_rows=keep, prepare=ready))
             except MapekError as error:
                 target = path.parent / f"broken-{unit}.npz"
                 _break_off(file, len(results) * config.episodes, target, config.loops)

@@ -186,7 +186,7 @@ class GymnasiumSystem:
 
     def get_state(self) -> Any:
         """Return what the environment carries from one episode to the next, or None where it does not say."""
-        return self._base.get_state() if self._says_state() else None
+        return self._base.get_state() if self.says_state else None
 
     def set_state(self, state: Any) -> None:
         """Let the environment take up what `get_state` returned.
@@ -196,7 +196,7 @@ class GymnasiumSystem:
         ValueError
             The environment does not take a state, or not this one.
         """
-        if self._says_state():
+        if self.says_state:
             self._base.set_state(state)
         elif state is not None:
             raise ValueError(f"{self.name} takes no state (no get_state and set_state); give None")
@@ -206,7 +206,9 @@ class GymnasiumSystem:
         """Close the environment."""
         self.env.close()
 
-    def _says_state(self) -> bool:
+    @property
+    def says_state(self) -> bool:
+        """Whether the environment says what it carries from one episode to the next."""
         return hasattr(self._base, "get_state") and hasattr(self._base, "set_state")
 
     def _see_mask(self, info: dict[str, Any]) -> None:

@@ -96,6 +96,7 @@ def episode(
         return OFF_TABLE, 0, float(state), -1.0, 0.0
     steps = 0
     ended = False
+    best = -1  # the greedy row of the present state, where it is known
     while steps < max_steps and not ended:
         allowed = 0
         exploring = draws[at_choice] < epsilon
@@ -109,6 +110,8 @@ def episode(
                 row = choices[int(draws[at_choice + 1] * allowed)]
             else:
                 row = rows[int(draws[at_choice + 1] * count)]
+        elif best >= 0:
+            row = best
         elif mask_greedy and allowed:
             row = greedy(q, choices, allowed, state)
         else:
@@ -124,6 +127,7 @@ def episode(
         ended = ended or terminated
 
         bootstrap = 0.0
+        best = -1
         if bootstrap_terminal or not terminated:
             allowed = 0
             if mask_greedy:
@@ -132,9 +136,13 @@ def episode(
                         choices[allowed] = rows[i]
                         allowed += 1
             if allowed:
-                bootstrap = value(q, choices, allowed, next_state, epsilon)
+                best = greedy(q, choices, allowed, next_state)
+                bootstrap = value(q, choices, allowed, next_state, best, epsilon)
             else:
-                bootstrap = value(q, rows, count, next_state, epsilon)
+                best = greedy(q, rows, count, next_state)
+                bootstrap = value(q, rows, count, next_state, best, epsilon)
+            if next_state == state:
+                best = -1  # the update below changes this very state
         old = q[row, state]
         td_error = reward + discount * bootstrap - old
         if not math.isfinite(td_error):

@@ -21,24 +21,27 @@ Ints = npt.NDArray[np.int64]
 def greedy(q: Floats, rows: Ints, count: int, state: int) -> int:
     """Return the row of the largest value of `state`; of equal ones, the first."""
     best: int = rows[0]
+    most: float = q[best, state]
     for i in range(1, count):
-        if q[rows[i], state] > q[best, state]:
+        worth = q[rows[i], state]
+        if worth > most:
             best = rows[i]
+            most = worth
     return best
 
 
-def max_value(q: Floats, rows: Ints, count: int, state: int, epsilon: float) -> float:
-    """Return the largest value of `state`: what Q-learning bootstraps from (Watkins 1989)."""
-    best: float = q[greedy(q, rows, count, state), state]
-    return best
+def max_value(q: Floats, rows: Ints, count: int, state: int, best: int, epsilon: float) -> float:
+    """Return the largest value of `state`, that of its row `best`: Q-learning bootstraps from it (Watkins 1989)."""
+    value: float = q[best, state]
+    return value
 
 
-def expected_value(q: Floats, rows: Ints, count: int, state: int, epsilon: float) -> float:
+def expected_value(q: Floats, rows: Ints, count: int, state: int, best: int, epsilon: float) -> float:
     """Return the mean value of `state` under the epsilon-greedy policy: Expected Sarsa (van Seijen et al. 2009)."""
     total = 0.0
     for i in range(count):
         total += q[rows[i], state]
-    return (1.0 - epsilon) * max_value(q, rows, count, state, epsilon) + epsilon * total / count
+    return (1.0 - epsilon) * max_value(q, rows, count, state, best, epsilon) + epsilon * total / count
 
 
 def alpha_star(td_error: float, rate: Floats) -> float:

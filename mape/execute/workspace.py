@@ -32,7 +32,7 @@ class Workspace:
         """Let the next episodes write `table`."""
         self._table = table
         # Stamps are episode numbers, from 1: a fresh table is untouched.
-        self._touched = np.zeros(table.values.shape, dtype=np.int64)
+        self._touched = np.zeros(table.values.shape, dtype=np.int64, order="F")
         self._actions = np.array(table.actions, dtype=np.int64)
 
     def offer(self, available: tuple[int, ...]) -> bool:
@@ -50,7 +50,7 @@ class Workspace:
 
     def roll_back(self) -> None:
         """Make the table what it was before the last episode."""
-        pairs = self._journal[: int(self.used[0])]
-        self._table.values.reshape(-1)[pairs] = self._saved[: len(pairs)]
+        pairs = np.divmod(self._journal[: int(self.used[0])], self._table.n_states)
+        self._table.values[pairs] = self._saved[: len(pairs[0])]
         # Driven again, the episode saves these pairs anew.
-        self._touched.reshape(-1)[pairs] = 0
+        self._touched[pairs] = 0

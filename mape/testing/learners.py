@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mape.compose import Composed, specialise
-from mape.execute.rules import Floats, Ints
+from mape.execute.rules import Floats, Ints, greedy
 from mape.ports import Learner
 from mape.testing.clauses import (
     Broken,
@@ -27,7 +27,8 @@ def probe(
 ) -> int:
     """Call a learner's rules on many inputs: a template, see `mape.compose`."""
     for i in range(len(states)):
-        values[i] = value(q, rows, 1 + i % len(rows), int(states[i]), epsilon)
+        count, state = 1 + i % len(rows), int(states[i])
+        values[i] = value(q, rows, count, state, greedy(q, rows, count, state), epsilon)
         sizes[i] = step_size(td_errors[i], rates[i])
     return len(states)
 

@@ -45,7 +45,7 @@ def test_new_actions_get_rows_of_zeros_and_the_old_rows_are_kept(old, new):
     assert made.actions == (*old, *fresh)
     np.testing.assert_array_equal(made.values[: len(old)], before)
     assert not made.values[len(old) :].any()
-    assert made.values.flags.c_contiguous
+    assert made.values.flags.f_contiguous
 
 
 @given(ids, st.data())
@@ -57,7 +57,7 @@ def test_dropped_actions_lose_their_rows_and_the_others_keep_theirs(actions, dat
     assert made.actions == tuple(a for a in actions if a not in gone)
     assert dict(zip(made.actions, made.values.tolist(), strict=True)) == {a: rows[a] for a in made.actions}
     assert made.values.shape == (len(made.actions), 4)
-    assert made.values.flags.c_contiguous
+    assert made.values.flags.f_contiguous
 
 
 def test_dropping_an_unknown_action_says_so_and_drops_nothing():

@@ -12,7 +12,9 @@ BALANCED = 2
 
 def uniform_for(rate, k):
     """Return a uniform that inversion turns into k arrivals."""
-    return next(u for u in np.linspace(0, 0.9999, 5_000) if traffic.poisson(rate, u) == k)
+    sums = np.array([*traffic.poisson_sums(rate), 1.0])
+    guide = traffic.guide_to(sums)
+    return next(u for u in np.linspace(0, 0.9999, 5_000) if traffic.poisson(sums, guide, u) == k)
 
 
 def after(queues, action, arrivals, **config):
@@ -56,7 +58,7 @@ def test_lanes_are_clipped_at_their_capacity_but_every_arrival_is_counted():
 def test_the_papers_actions_and_rates_are_the_defaults():
     env = TrafficJunction()
     assert env.rules.params.services.tolist() == [[5, 2], [2, 5], [3, 3], [7, 3], [3, 7]]
-    assert env.rules.params.rates.tolist() == [[4, 2], [5, 7], [3, 1]]
+    assert env.rates == ((4, 2), (5, 7), (3, 1))
     assert env.rules.drifts == (3001, 8001)
     assert [env.rules.phase(env.rules.params, e) for e in (3000, 3001, 8000, 8001)] == [0, 1, 1, 2]
     assert env.rules.n_states == 121

@@ -5,16 +5,16 @@ from typing import NamedTuple
 import numpy as np
 
 
-def writes_q(q, rows, count, state, epsilon):
+def writes_q(q, rows, count, state, best, epsilon):
     q[rows[0], state] += 1.0
     return q[rows[0], state]
 
 
-def infinite(q, rows, count, state, epsilon):
+def infinite(q, rows, count, state, best, epsilon):
     return np.inf
 
 
-def overflows(q, rows, count, state, epsilon):
+def overflows(q, rows, count, state, best, epsilon):
     return float((state + 1) * 4_000_000_000 * 4_000_000_000)
 
 
