@@ -1,11 +1,14 @@
-"""What all tests share: Hypothesis' profile, and a cache of compiled code that is not the user's."""
+"""What all tests share: Hypothesis' profile, a cache of compiled code that is not the user's, an end to every hang."""
 
+import faulthandler
 import importlib
 import os
 import sys
 import tempfile
+import time
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # pytest puts this folder on the path, where the folders `knowledge` and `mape` would be taken for the packages; the
@@ -33,3 +36,36 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("mapek")
+
+# A test that is out of time is failed by a signal, and the signal's handler is Python: it never runs where native code
+# stands still, with the GIL or without. So many seconds later a thread of faulthandler's, which needs no GIL, says what
+# every thread does and ends the process; xdist names the test, and goes on with another worker.
+GRACE = 30.0
+_STDERR = pytest.StashKey[int]()
+_END = pytest.StashKey[float]()
+
+
+def pytest_configure(config):
+    config.stash[_STDERR] = os.dup(sys.__stderr__.fileno())  # while a test runs, pytest captures what goes there
+
+
+def _end_by_itself_or_be_ended(item):
+    left = max(GRACE, item.stash[_END] - time.monotonic())
+    faulthandler.dump_traceback_later(left, exit=True, file=item.config.stash[_STDERR])
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_timeout_set_timer(item, settings):
+    item.stash[_END] = time.monotonic() + settings.timeout + GRACE
+    _end_by_itself_or_be_ended(item)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item):
+    if _END in item.stash:  # pytest has called it off if the test failed, and a failed one hangs first of all
+        _end_by_itself_or_be_ended(item)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_timeout_cancel_timer():
+    faulthandler.cancel_dump_traceback_later()

@@ -20,6 +20,7 @@ plan (ChangePlan). Knowledge is the router; `operator` is a person who looks on,
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import re
@@ -153,9 +154,11 @@ class Wire:
         if self.tls is not None:
             edges["access_control"] = security.access_control()
             security.log_refusals()
-        return _open(
-            self._config("router", "knowledge", **edges),
-            f"cannot listen on {self.endpoint}; is another Knowledge running there?",
+        return never_freed(
+            _open(
+                self._config("router", "knowledge", **edges),
+                f"cannot listen on {self.endpoint}; is another Knowledge running there?",
+            )
         )
 
     def join(self, role: str, patience: float) -> zenoh.Session:
@@ -291,3 +294,14 @@ def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:
     except zenoh.ZError as error:
         # Of what Zenoh says, the places in its sources help nobody here.
         raise BusError(f"{otherwise} ({re.split(r'[.]? at /', str(error))[0]})") from error
+
+
+def never_freed(router: zenoh.Session) -> zenoh.Session:
+    """Return a router's session, kept as long as its process lives; once closed, it takes some 20 kB.
+
+    To free one is to wait, with the GIL held, for a task on a thread of Zenoh's. Where that thread itself waits for the
+    GIL, to hand over what came for another session, the process stands still for ever; and garbage is freed at any
+    moment, by any thread.
+    """
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(router))
+    return router

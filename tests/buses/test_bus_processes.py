@@ -42,6 +42,32 @@ def test_a_process_that_closes_nothing_still_ends(endpoint, how, code):
     assert got == code, err
 
 
+def test_a_closed_knowledge_may_be_forgotten_while_zenoh_calls_python(endpoint):
+    program = f"""{BEGIN}
+    from queue import SimpleQueue
+    from threading import Event
+    import zenoh
+    from adapters.buses.wire import hand_over
+
+    called, never, answers = Event(), Event(), []
+
+    def hear(answer):
+        called.set()
+        never.wait(0.3)  # without the GIL, which it then needs to return
+        answers.append(answer.err.payload.to_string())
+
+    first = wire.listen()
+    first.close()
+    with wire.listen() as second:
+        second.declare_queryable("mape/question", hand_over(SimpleQueue(), "held, and not answered"))
+        second.get("mape/question", zenoh.handlers.Callback(hear, indirect=False), timeout=0.05)
+        assert called.wait(10)
+        del first
+    assert answers == ["Timeout"]
+    """
+    assert ended(start(program, endpoint), within=10) == (0, "", "")
+
+
 def test_one_that_is_interrupted_while_it_waits_ends(endpoint, wire):
     program = f"""{BEGIN}
     with Member(wire, "plan", waiting=lambda sentence: print(sentence, flush=True)) as peer:

@@ -12,6 +12,7 @@ import zenoh
 
 from adapters.buses import security
 from adapters.buses.signing import Authority, Pem
+from adapters.buses.wire import never_freed
 
 PATIENCE = 5.0
 STATUS = "mape/s/knowledge/status"
@@ -45,7 +46,8 @@ def listen(link, address="tls/127.0.0.1", **edges):
             probe.bind((address.partition("/")[2], 0))
             port = probe.getsockname()[1]
         try:
-            return zenoh.open(config("router", link, listen={"endpoints": [f"{address}:{port}"]}, **edges)), port
+            router = zenoh.open(config("router", link, listen={"endpoints": [f"{address}:{port}"]}, **edges))
+            return never_freed(router), port
         except zenoh.ZError as error:
             if "Address already in use" not in str(error):
                 raise
