@@ -6,6 +6,7 @@ engine that runs passes; so a per-episode table is the log itself, seen by colum
 
 from __future__ import annotations
 
+import functools
 import json
 import struct
 from typing import Any
@@ -77,8 +78,8 @@ class RowLayout:
         self.dtype = np.dtype([_column(*field) for field in hot + rare])
         assert self.dtype.itemsize == self.struct.size
         self._words = words
-        self._last_key: tuple[Any, ...] = ()
-        self._last_rare = b""
+        self._last: tuple[tuple[Any, ...], bytes] = ((), b"")
+        self._packed = functools.lru_cache(maxsize=256)(self._pack_rare)
 
     @property
     def schema(self) -> bytes:
@@ -122,9 +123,10 @@ class RowLayout:
         _, _, next_epsilon, rate, add, drop, enable, next_reset, adopt = plan
         key = (directions, drifts, reset, next_reset, available, known, added, removed, add, drop, enable, rate, adopt)
         try:
-            if key != self._last_key:
-                self._last_rare = self._pack_rare(*key)
-                self._last_key = key
+            last_key, rare = self._last
+            if key != last_key:
+                rare = self._packed(*key)
+                self._last = key, rare
             self.struct.pack_into(
                 buffer,
                 offset,
@@ -135,7 +137,7 @@ class RowLayout:
                 next_epsilon,
                 *signals.values(),
                 *numbers,
-                self._last_rare,
+                rare,
             )
         except struct.error as error:
             raise self._misfit(seen, str(error)) from error
@@ -196,7 +198,7 @@ class RowLayout:
             reset,
             next_reset,
             *masks,
-            *rate,
+            *[number + 0.0 for number in rate],  # -0.0 equals 0.0, so the bytes of either may have been kept
             b"" if adopt is None else _hash_bytes(adopt),
         )
 

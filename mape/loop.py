@@ -9,6 +9,7 @@ Observation -> Monitor -> Symptom -> Analyze -> ChangeRequest -> Plan -> ChangeP
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -45,7 +46,10 @@ def layout_of(config: Config, system: ManagedSystem) -> RowLayout:
                 f"detector {detector.name!r} watches signal {detector.signal!r}; {system.name} has {', '.join(signals)}"
             )
     learner = make("learner", config.learner)
-    return RowLayout(signals, len(config.monitor.detectors), len(learner.rate_names), config.system.max_actions)
+    return _layout(signals, len(config.monitor.detectors), len(learner.rate_names), config.system.max_actions)
+
+
+_layout = functools.lru_cache(maxsize=16)(RowLayout)
 
 
 def build_monitor(config: Config, send: Send) -> Monitor:

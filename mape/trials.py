@@ -126,11 +126,17 @@ def chunks(units: Sequence[int], size: int) -> list[tuple[int, int]]:
 
 
 def each_completed(
-    executor: Executor, work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], in_flight: int
+    executor: Executor,
+    work: Callable[..., Any],
+    tasks: Iterable[tuple[Any, ...]],
+    in_flight: int,
+    *,
+    here: bool = False,
 ) -> Iterator[Any]:
     """Submit `tasks` and yield results as they come, with at most `in_flight` of them submitted at a time.
 
-    What `work` raises is raised here, after the tasks that are running have ended; the others are not begun.
+    What `work` raises is raised here, after the tasks that are running have ended; the others are not begun. Where
+    `here` is true, who asks for the next result works on a task too, as long as there is one, and does not just wait.
     """
     waiting: set[Future[Any]] = set()
     pending = iter(tasks)
@@ -138,9 +144,12 @@ def each_completed(
         while True:
             while len(waiting) < in_flight and (task := next(pending, None)) is not None:
                 waiting.add(executor.submit(work, *task))
-            if not waiting:
+            at_hand = next(pending, None) if here else None
+            if at_hand is not None:
+                yield work(*at_hand)
+            elif not waiting:
                 return
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            done, waiting = wait(waiting, timeout=None if at_hand is None else 0.0, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
     finally:

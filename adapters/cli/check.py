@@ -1,13 +1,14 @@
-"""`mapek check`: a part or a system against the contract of its port."""
+"""`mapek check`: a part, a system, or the system of a config, against the contract of its port."""
 
 from __future__ import annotations
 
 import argparse
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from adapters.cli.common import prepare
+from adapters.cli.common import config_of, prepare
 from mape import registry, testing
 from mape.config import SystemConfig
 from mape.errors import ConfigError, UnknownName
@@ -27,14 +28,26 @@ _MEMBERS = {
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command; exit code 1 where a clause is broken."""
     prepare()
-    kind = chosen.kind or _kind_of(chosen.name)
-    findings = _system(chosen.name) if kind == "system" else testing.CHECKS[kind](_maker(kind, chosen.name))
-    print(f"{kind} {chosen.name}")
+    if Path(chosen.name).suffix in (".toml", ".json"):
+        kind, name, findings = _of_config(chosen)
+    else:
+        kind, name = chosen.kind or _kind_of(chosen.name), chosen.name
+        if chosen.profile or chosen.overrides:
+            raise ConfigError(f"--profile and --set are laid over a config; {name!r} is the name of a {kind}")
+        findings = _default_system(name) if kind == "system" else testing.CHECKS[kind](_maker(kind, name))
+    print(f"{kind} {name}")
     for finding in findings:
         print(f"  {finding}")
     broken = sum(finding.verdict == "failed" for finding in findings)
     print(f"{len(findings)} checks, {broken} failed" if broken else f"{len(findings)} checks, all kept")
     return 1 if broken else 0
+
+
+def _of_config(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
+    if chosen.kind not in (None, "system"):
+        raise ConfigError(f"of a config the system is checked; give the name of the {chosen.kind} itself")
+    config = config_of(chosen.name, chosen).system
+    return "system", f"{config.id} of {chosen.name}", _system(config)
 
 
 def _kind_of(name: str) -> str:
@@ -96,10 +109,16 @@ def _maker(kind: str, name: str) -> Callable[[], Any]:
     return make
 
 
-def _system(name: str) -> list[Finding]:
-    from adapters.systems import make_system
-    from adapters.systems.checking import check_environment, default_view
+def _default_system(name: str) -> list[Finding]:
+    from adapters.systems.checking import default_view
 
     registry.look_here()
-    config: SystemConfig = default_view(name)
+    return _system(default_view(name))
+
+
+def _system(config: SystemConfig) -> list[Finding]:
+    from adapters.systems import make_system
+    from adapters.systems.checking import check_environment
+
+    registry.look_here()
     return [check_environment(config), *testing.check_system(lambda: make_system(config))]

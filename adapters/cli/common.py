@@ -28,7 +28,7 @@ def prepare() -> None:
 
 
 def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = None, **defaults: Any) -> Config:
-    """Load a config with the command line's profile, overrides, seed and trials laid over it.
+    """Load a config with the command line's profile, overrides, seed, trials and engine laid over it.
 
     `defaults` fill what the command line leaves open.
     """
@@ -38,6 +38,8 @@ def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = 
         value = defaults.get(key) if value is None else value
         if value is not None:
             overrides.append(f"{key}={value}")
+    if (engine := getattr(chosen, "engine", None)) is not None:
+        overrides.append(f"execute.engine={engine}")
     return load(path, profile=chosen.profile or defaults.get("profile"), agent=agent, overrides=overrides)
 
 
@@ -58,12 +60,23 @@ def open_folder(
         raise ConfigError(f"--out {chosen.out!r} is a file; name a folder, which may be new")
     for agent, config in configs.items():
         check_name(agent)
-        check(config)
+        checked = check(config)
+        if getattr(chosen, "verbose", False):
+            print(f"{agent}: {checked}{_looked_at(chosen, trace)}", file=sys.stderr)
     path = Path(chosen.out) if chosen.out else default_path(name)
     folder = RunFolder(path, kind, configs, trace, chosen.arguments)
     if folder.resumed:
         say(chosen, f"continuing in {folder.path}: {folder.resumed} trials are finished already")
     return folder
+
+
+def _looked_at(chosen: argparse.Namespace, trace: tuple[int, int] | None) -> str:
+    """Say which passes are made one by one all the same, because somebody looks at them."""
+    if getattr(chosen, "show", None) is not None:
+        return "; the passes of trial 0 are made one by one, to be shown"
+    if trace is not None:
+        return f"; passes {trace[0]} to {trace[1]} of trial 0 are made one by one, to be traced"
+    return ""
 
 
 @contextlib.contextmanager

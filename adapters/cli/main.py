@@ -72,6 +72,9 @@ def parser() -> argparse.ArgumentParser:
     reproduce.add_argument("experiment", choices=["table1", "jump", "traffic"])
     _what_runs(reproduce)
     _where_to(reproduce)
+    reproduce.add_argument(
+        "--no-statistics", action="store_true", help="run, store and hash; leave out what the paper's tables say"
+    )
 
     step = commands.add_parser(
         "step", help="advance record by record on Enter", description="Step through a run, record by record."
@@ -203,7 +206,11 @@ def parser() -> argparse.ArgumentParser:
         help="hold a part or system against its contract",
         description="Check that a part or a system keeps the contract of its port.",
     )
-    check.add_argument("name", metavar="NAME|module:Class", help="short name, Gymnasium id, or a part of your own")
+    check.add_argument(
+        "name", metavar="NAME|module:Class|CONFIG",
+        help="short name, Gymnasium id, a part of your own, or a config, of which the system is checked",
+    )  # fmt: skip
+    _overlays(check, seed=False)
     check.add_argument("--kind", choices=["detector", "analyzer", "planner", "schedule", "learner", "system"])
     return top
 
@@ -290,19 +297,25 @@ def _failed(error: Exception) -> int:
     return 2 if isinstance(error, ConfigError) else 1
 
 
-def _overlays(command: argparse.ArgumentParser) -> None:
+def _overlays(command: argparse.ArgumentParser, *, seed: bool = True) -> None:
     command.add_argument("--profile", metavar="NAME", help="lay the config's [profiles.NAME] over it")
     command.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
         help="override, such as plan.alpha=0.2; VALUE is TOML (repeatable)",
     )  # fmt: skip
-    command.add_argument("--seed", type=_natural, metavar="N", help="root of all randomness")
+    if seed:
+        command.add_argument("--seed", type=_natural, metavar="N", help="root of all randomness")
 
 
 def _what_runs(command: argparse.ArgumentParser) -> None:
     _overlays(command)
     command.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions")
     command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one per core)")
+    command.add_argument(
+        "--engine", choices=["auto", "python", "compiled"],
+        help="compile what can be (auto), nothing, or everything; the bits are the same",
+    )  # fmt: skip
+    command.add_argument("-v", "--verbose", action="store_true", help="say of each agent what is compiled, and why")
 
 
 def _how(command: argparse.ArgumentParser) -> None:

@@ -49,7 +49,8 @@ def execute(chosen: argparse.Namespace) -> int:
         results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet)
         say(chosen)
         result = {"experiment": chosen.experiment, "profile": profile, "trials": configs[agents[0]].trials}
-        result |= kind(chosen, folder, configs, results)
+        if not chosen.no_statistics:
+            result |= kind(chosen, folder, configs, results)
         result |= {
             "log_sha256": combined_hash(r.log_sha256 for agent in agents for r in results[agent]),
             "q_table_sha256": combined_hash(r.q_table_sha256 for agent in agents for r in results[agent]),

@@ -63,4 +63,4 @@ def _find_config(again: argparse.Namespace, manifest: dict[str, Any], opened: co
     kept = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="mapek-")), "config.json")
     kept.write_text(json.dumps({**config, "agents": {label: {}}}), encoding="utf-8")
     again.config, again.agent = str(kept), label if again.agent else None
-    again.profile, again.overrides, again.seed, again.trials = None, [], None, None
+    again.profile, again.overrides, again.seed, again.trials, again.engine = None, [], None, None, None

@@ -88,7 +88,7 @@ def _own_endpoint(opened: contextlib.ExitStack) -> str:
 def _check(config: Config) -> object:
     # What a free-running system is made of can be looked at as if it waited.
     still = config.execute.model_copy(update={"mode": "lockstep", "rate": None})
-    return check(config.model_copy(update={"execute": still}))
+    return check(config.model_copy(update={"execute": still}), in_processes=True)
 
 
 def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, folder: RunFolder) -> None:

@@ -12,12 +12,13 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from tqdm import tqdm
 
 from adapters.results import RunFolder
 from adapters.results.chunk import run_chunk
+from adapters.results.folder import assemble
 from adapters.systems import make_system
 from mape import compose
 from mape.config import Config
@@ -26,20 +27,50 @@ from mape.loop import Loop
 from mape.trials import TrialResult, chunks, each_completed
 
 CHUNK_SECONDS = 0.8
-PASS_SECONDS, STEP_SECONDS = 20e-6, 10e-6  # rough costs of a pass, and of a step that is not compiled
-TRIAL_SECONDS = 5e-3  # a trial's own: its system, its components, its table
+LEAST_SECONDS = 0.1  # of a chunk of a short run: in less time its files would weigh
+CHUNKS_PER_WORKER = 8  # at least, in a run that is long enough: so they end nearly together, and progress is seen
 CHUNK_BYTES = 16_000_000  # of Q-tables, which a worker holds until its chunk is written
+# Rough costs, in seconds.
+TRIAL_SECONDS = 0.5e-3  # a trial's own: its system, its components, its table
+PASS_SECONDS = {"passes": 0.5e-6, "episodes": 8e-6, "nothing": 20e-6}  # of a pass, by what is compiled
+STEP_SECONDS = {"passes": 25e-9, "episodes": 25e-9, "nothing": 10e-6}  # of a step of the longest episode
 
 
 Task = tuple[str, int, int, str, tuple[int, int] | None]
 """Arguments of `run_chunk`."""
 
 
-class Checked(NamedTuple):
-    """What making a config's parts tells about the cost of a trial."""
+class Stage(NamedTuple):
+    """What is compiled of the passes from number `first` on.
 
-    compiled: bool
+    `compiled` is ``"passes"``, whole stretches of them; ``"episodes"`` alone; or ``"nothing"``. `obstacles` says in
+    clauses what keeps it from more.
+    """
+
+    first: int
+    compiled: Literal["passes", "episodes", "nothing"]
+    obstacles: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        what = {"passes": "whole stretches of passes are", "episodes": "only episodes are", "nothing": "nothing is"}
+        because = f", because {' and '.join(self.obstacles)}" if self.obstacles else ""
+        return f"{what[self.compiled]} compiled{because}"
+
+
+class Checked(NamedTuple):
+    """What making a config's parts tells about the cost of a trial.
+
+    `stages` has one more entry for each planned swap after which something else is compiled than before; `max_steps`
+    is the longest episode.
+    """
+
+    stages: tuple[Stage, ...]
+    max_steps: int
     table_bytes: int
+
+    def __str__(self) -> str:
+        first, *later = self.stages
+        return "; ".join([str(first), *(f"from pass {stage.first} on {stage}" for stage in later)])
 
 
 class Stopped(MapekError):
@@ -64,7 +95,7 @@ def run_agents(
     folder
         Where results are stored as they come.
     workers
-        Processes; None for one per core. One trial, or one worker, runs in this process.
+        Processes, of which this one is the first; None for one per core.
     trace
         Episodes of unit 0, the first loop of trial 0, whose steps are kept.
     prepare
@@ -81,26 +112,29 @@ def run_agents(
     MapekError
         A trial failed, or the disk is full.
     """
+    workers = workers or os.cpu_count() or 1
     finished = {agent: folder.finished(agent) for agent in configs}
     tasks: list[Task] = []
     for agent, config in configs.items():
         checked = check(config)
         missing = [unit for unit in range(config.units) if unit not in finished[agent]]
-        for first, count in chunks(missing, chunk_size(config, checked)):
+        for first, count in chunks(missing, chunk_size(config, checked, workers)):
             tasks.append((config.to_json(), first, count, folder.chunk_stem(agent, first, count), trace))
     total = sum(config.units * config.episodes for config in configs.values())
     done = sum(len(finished[agent]) * config.episodes for agent, config in configs.items())
-    workers = min(workers or os.cpu_count() or 1, len(tasks))
+    workers = min(workers, len(tasks))
     with tqdm(
         total=total, initial=done, unit=" episodes", unit_scale=True, disable=True if quiet else None, leave=False,
         dynamic_ncols=True, smoothing=0.1,
     ) as bar:  # fmt: skip
         try:
             if workers > 1 and prepare is None:
-                _run_in_workers(tasks, workers, bar)
+                _run_in_workers(tasks, list(map(folder.assembly, configs)), workers, bar)
             else:
                 for task in tasks:
                     run_chunk(*task, on_rows=lambda rows: bar.update(len(rows)), prepare=prepare)
+                for agent in configs:
+                    folder.assemble(agent)
         except KeyboardInterrupt:
             kept = sum(len(folder.finished(agent)) for agent in configs)
             wanted = sum(config.units for config in configs.values())
@@ -110,47 +144,74 @@ def run_agents(
                 f"the same command with --out {folder.path} continues."
             ) from None
     results = {agent: folder.finished(agent) for agent in configs}
-    for agent in configs:
-        folder.assemble(agent)
     return {agent: [found[unit] for unit in sorted(found)] for agent, found in results.items()}
 
 
-def chunk_size(config: Config, checked: Checked) -> int:
-    """Return how many trials make about a second of work, with Q-tables that fit into a worker's memory."""
-    cap = config.system.max_steps or 200
-    episode = PASS_SECONDS if checked.compiled else PASS_SECONDS + cap * STEP_SECONDS
-    trials = CHUNK_SECONDS / (TRIAL_SECONDS + config.episodes * episode)
-    return max(1, int(min(trials, CHUNK_BYTES / checked.table_bytes)))
+def chunk_size(config: Config, checked: Checked, workers: int) -> int:
+    """Return how many trials make a chunk.
+
+    It is about a second of work, and less where the run would else have only few chunks for each worker; its Q-tables
+    fit into a worker's memory.
+    """
+    costs = ((PASS_SECONDS[stage.compiled], STEP_SECONDS[stage.compiled]) for stage in checked.stages)
+    trial = TRIAL_SECONDS + config.episodes * max(one + checked.max_steps * step for one, step in costs)
+    share = config.units * trial / (workers * CHUNKS_PER_WORKER)
+    seconds = min(CHUNK_SECONDS, max(LEAST_SECONDS, share))
+    return max(1, int(min(seconds / trial, CHUNK_BYTES / checked.table_bytes)))
 
 
-def check(config: Config) -> Checked:
+def check(config: Config, *, in_processes: bool = False) -> Checked:
     """Make all that a config names, what it is to swap among it, and say what that tells about the cost of a trial.
 
     In this process first: what is wrong with a config is said at once, and the compiled code is in the cache before
     several workers want it.
 
+    Parameters
+    ----------
+    config
+        Of a run that waits for its plans.
+    in_processes
+        Whether each component is to be a process of its own: then episodes are all that can be compiled.
+
     Raises
     ------
     MapekError
-        Something cannot be made.
+        Something cannot be made or compiled.
     """
     system = make_system(config.system)
     try:
         loop = Loop(config, system)
-        for _ in config.swap:
-            loop.swap()
-        return Checked(loop.execute.compiled, loop.execute.q_table.values.nbytes)
+        stages: list[Stage] = []
+        for first in sorted({1, *(swap.pass_no for swap in config.swap)}):
+            for _ in (swap for swap in config.swap if swap.pass_no == first):
+                loop.swap()
+            stage = _stage(loop, first, in_processes)
+            if not stages or stage[1:] != stages[-1][1:]:
+                stages.append(stage)
+        return Checked(tuple(stages), system.max_steps, loop.execute.q_table.values.nbytes)
     finally:
         system.close()
 
 
-def _run_in_workers(tasks: list[Task], workers: int, bar: Any) -> None:
-    # Spawn, never fork: a forked process inherits threads' locks.
+def _stage(loop: Loop, first: int, in_processes: bool) -> Stage:
+    if not in_processes and loop.stretches() is not None:
+        return Stage(first, "passes")
+    obstacles = ("each component is a process of its own",) if in_processes else tuple(loop.obstacles())
+    return Stage(first, "episodes" if loop.execute.compiled else "nothing", obstacles)
+
+
+def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], workers: int, bar: Any) -> None:
+    # This process is the first of the workers: it is there already, with all that is compiled. Spawn the others, never
+    # fork: a forked process inherits threads' locks. And processes, not threads: what is not compiled of a trial takes
+    # as long as what is, and holds the lock of the interpreter.
     context = multiprocessing.get_context("spawn")
-    with _Pool(workers, mp_context=context, initializer=_start_worker) as pool:
+    others = workers - 1
+    with _Pool(others, mp_context=context, initializer=_start_worker) as pool:
         try:
-            for results in each_completed(pool, run_chunk, tasks, in_flight=2 * workers):
+            for results in each_completed(pool, run_chunk, tasks, in_flight=2 * others, here=True):
                 bar.update(sum(result.passes for result in results))
+            for _ in each_completed(pool, assemble, assemblies, in_flight=others, here=True):
+                pass
         except BrokenProcessPool:
             raise MapekError(
                 "a worker process died (killed, or out of memory?); finished trials are kept, and the same command "

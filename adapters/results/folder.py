@@ -104,6 +104,32 @@ def read_manifest(path: Path, way_out: str = "name the folder that `mapek` wrote
     return there
 
 
+def _stems(path: Path, agent: str) -> list[Path]:
+    return sorted(p.with_suffix("") for p in (path / "chunks" / agent).glob("*.json"))
+
+
+def assemble(folder: str, agent: str, rows: int, loops: int) -> None:
+    """Make an agent's tables, of `rows` rows, of the chunks of all its trials, each of so many loops.
+
+    Raises
+    ------
+    ResultsError
+        A chunk is damaged, or the tables cannot be written.
+    """
+    path = Path(folder)
+    stems = _stems(path, agent)
+    write_npz(path / f"episodes-{agent}.npz", [stem.with_suffix(".rows") for stem in stems], rows, loops=loops)
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    for stem in stems:
+        arrays.update(read_arrays(stem))
+    trace = arrays.pop("trace", None)
+    if trace is not None:
+        with whole(path / f"trace-{agent}.npy") as file:
+            np.save(file, trace, allow_pickle=False)
+    with whole(path / f"q_tables-{agent}.npz") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+
+
 class RunFolder:
     """A folder that holds one run, of one or several agents, and nothing else.
 
@@ -203,7 +229,7 @@ class RunFolder:
         return str(folder / f"{first:08d}-{first + count - 1:08d}")
 
     def _stems(self, agent: str) -> list[Path]:
-        return sorted(p.with_suffix("") for p in (self.path / "chunks" / agent).glob("*.json"))
+        return _stems(self.path, agent)
 
     def finished(self, agent: str) -> dict[int, TrialResult]:
         """Return the results of the trials that are on disk, by number."""
@@ -213,25 +239,14 @@ class RunFolder:
                 found[self.configs[agent].unit(result.trial, result.loop)] = result
         return found
 
+    def assembly(self, agent: str) -> tuple[str, str, int, int]:
+        """Return the arguments with which `assemble` makes the agent's tables of its chunks, in any process."""
+        config = self.configs[agent]
+        return str(self.path), agent, config.units * config.episodes, config.loops
+
     def assemble(self, agent: str) -> None:
         """Make the agent's tables of its chunks."""
-        stems = self._stems(agent)
-        config = self.configs[agent]
-        write_npz(
-            self.path / f"episodes-{agent}.npz",
-            [stem.with_suffix(".rows") for stem in stems],
-            config.units * config.episodes,
-            loops=config.loops,
-        )
-        arrays: dict[str, npt.NDArray[Any]] = {}
-        for stem in stems:
-            arrays.update(read_arrays(stem))
-        trace = arrays.pop("trace", None)
-        if trace is not None:
-            with whole(self.path / f"trace-{agent}.npy") as file:
-                np.save(file, trace, allow_pickle=False)
-        with whole(self.path / f"q_tables-{agent}.npz") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+        assemble(*self.assembly(agent))
 
     def episodes(self, agent: str, *columns: str) -> dict[str, npt.NDArray[Any]]:
         """Return columns of the agent's table, each of shape (trials, episodes)."""

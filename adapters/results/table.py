@@ -50,6 +50,9 @@ DTYPE = np.dtype(
 COLUMNS: tuple[str, ...] = tuple(name for name in DTYPE.names or () if name != "loop")
 """Columns of every table."""
 
+NOISE = ("td_error", "q_change")
+"""Columns that are stored as they are: they would take most of the time of packing, and become hardly smaller."""
+
 BLOCK = 65_536
 """Rows that are held in memory at a time."""
 
@@ -76,8 +79,9 @@ def write_npz(path: Path, chunks: Iterable[Path], rows: int, skip: int = 0, *, l
     numbers.
     """
     files = list(chunks)
-    with whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with whole(path) as file, zipfile.ZipFile(file, "w", compresslevel=1) as archive:
         for column in (*COLUMNS, "loop") if loops > 1 else COLUMNS:
+            archive.compression = zipfile.ZIP_STORED if column in NOISE else zipfile.ZIP_DEFLATED
             with archive.open(f"{column}.npy", "w", force_zip64=True) as member:
                 _write_column(member, column, files, rows, skip)
 

@@ -12,6 +12,7 @@ ok      is deterministic: two fresh ones agree, step by step
 ok      gives its state as plain JSON, and as a copy
 ok      takes up where its state was given, fresh or used
 ok      forgets on reset the values that it has seen
+ok      has a rule that does what its methods do, in Python and compiled
 
 In a test of your own, ``require(check_detector(make))`` raises where a clause is broken.
 """

@@ -33,6 +33,7 @@ from mape.testing.clauses import (
     travels,
     walk,
 )
+from mape.testing.quiet import by_rule
 
 PASSES = 60
 """Passes that analyzers, schedules and planners are put through."""
@@ -78,6 +79,7 @@ def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
             ("keeps epsilon in [0, 1]", walk(make, script, PASSES)),
             *resumable(make, script, PASSES),
             ("starts anew on reset, whatever the returns before it", explores_anew),
+            by_rule("schedule", make, script, PASSES),
         ],
     )
 
@@ -93,10 +95,10 @@ def check_analyzer(make: Callable[[], Analyzer]) -> list[Finding]:
     returns = stream_of((0, 60, PASSES))
 
     def symptom(i: int) -> Symptom:
-        signals = {"return": returns[i], "steps": 10.0 + i}
+        signals = dict.fromkeys(SIGNALS, 1.0) | {"return": returns[i], "steps": 10.0 + i}
         readings = tuple(
-            Reading(name, value, None if i % 3 else abs(value), i % divisor == 5, direction)
-            for (name, value), divisor, direction in zip(signals.items(), (11, 7), get_args(Direction)[:2], strict=True)
+            Reading(name, signals[name], None if i % 3 else abs(signals[name]), i % divisor == 5, direction)
+            for name, divisor, direction in zip(SIGNALS[:2], (11, 7), get_args(Direction)[:2], strict=True)
         )
         available = (0, 1, 2) if i % 20 < 10 else (1, 4, 0)
         return Symptom(3, i + 1, signals, available, (0, 1, 2) if i % 10 else (0, 2, 9), readings)
@@ -110,6 +112,7 @@ def check_analyzer(make: Callable[[], Analyzer]) -> list[Finding]:
         [
             ("gives change requests that fit their symptom", walk(make, script, PASSES)),
             *resumable(make, script, PASSES),
+            by_rule("analyzer", make, script, PASSES),
         ],
     )
 
@@ -146,6 +149,7 @@ def check_planner(make: Callable[[], Planner]) -> list[Finding]:
         [
             ("gives plans that can be executed, with epsilon in [0, 1]", walk(make, script, PASSES)),
             *resumable(make, script, PASSES),
+            by_rule("planner", make, script, PASSES),
         ],
     )
 

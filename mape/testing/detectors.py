@@ -17,6 +17,7 @@ from mape.testing.clauses import (
     stream_of,
     walk,
 )
+from mape.testing.quiet import by_rule
 
 STREAM = stream_of((50, 5, 150), (-400, 5, 60), (-400, 0, 40), (9000, 200, 240), (-9000, 1, 60))
 """Signal that a detector is checked on: noise, falls, a rise, a stretch without any noise."""
@@ -56,6 +57,7 @@ def check_detector(make: Callable[[], Detector], stream: Sequence[float] = STREA
             ("gives plain readings: a bool, and a finite statistic or None", walk(make, script, len(stream))),
             *resumable(make, script, len(stream)),
             ("forgets on reset the values that it has seen", forgets),
+            by_rule("detector", make, script, len(stream)),
         ],
     )
 

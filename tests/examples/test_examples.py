@@ -49,6 +49,37 @@ def test_the_readme_shows_the_file_itself_in_at_most_20_lines_of_code(name):
     assert len([line for line in text.splitlines() if line.strip()]) <= 20
 
 
+def test_a_rule_of_ones_own_is_compiled_with_the_rest_and_gives_the_hash_of_python(here):
+    compiled, plain = (
+        _typed(f"{line} -v -q --no-figures --out results/{name}", here)
+        for line, name in zip(_lines("mapek run examples/own_rule.toml"), ("compiled", "plain"), strict=True)
+    )
+    assert "own_rule: whole stretches of passes are compiled" in compiled
+    assert "own_rule: nothing is compiled, because the engine is python" in plain
+    assert _hashes(here / "results" / "compiled") == _hashes(here / "results" / "plain")
+    alarms = json.loads((here / "results" / "plain" / "result.json").read_bytes())["trials"][0]["alarms"]
+    for drift, alarm in zip((301, 601, 901, 1201), alarms, strict=True):
+        assert drift <= alarm < drift + 20
+
+
+def test_the_readme_shows_a_part_of_the_rule_of_ones_own_and_how_it_is_checked(here):
+    text = (ROOT / "examples" / "own_rule.py").read_text(encoding="utf-8")
+    (shown,) = (code for code in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL) if "QuietRule" in code)
+    assert shown in text
+    assert len([line for line in shown.splitlines() if line.strip()]) <= 24
+    (line,) = re.findall(r"`(mapek check examples\S+:\S+)`", README)
+    said = _typed(line, here)
+    assert "ok      has a rule that does what its methods do, in Python and compiled" in said
+    (line,) = re.findall(r"`(mapek check examples\S+\.toml [^`]*)`", README)
+    assert "ok      has rules that equal its steps, bit for bit" in _typed(line, here)
+
+
+def test_a_subclass_whose_base_has_a_rule_is_made_in_python_as_the_readme_says(here):
+    options = "-v -q --no-figures --set episodes=3 --set plan=examples.swap_planner:Gentle --out results/gentle"
+    said = _typed(f"mapek run examples/traffic.toml {options}", here)
+    assert "traffic: only episodes are compiled, because planner Gentle declares no rule" in said
+
+
 def test_a_pass_is_taught_in_about_20_lines_and_says_all_four_records():
     text = (ROOT / "examples" / "teach_a_pass.py").read_text(encoding="utf-8")
     assert len([line for line in text.splitlines() if line.strip()]) <= 21

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from adapters.experiments import pictures
-from adapters.experiments.runner import Checked, check, chunk_size, run_agents
+from adapters.experiments.runner import Checked, Stage, check, chunk_size, run_agents
 from adapters.results import RunFolder
 from mape.config import from_table
+from mape.monitor.page_hinkley import PageHinkley, PageHinkleyConfig
 
 GRID = {
     "id": "mapek/Gridworld-v0",
@@ -21,20 +22,69 @@ def grid(switch_at=(), **over):
     return from_table({"name": "grid", "episodes": 5, "system": system, "plan": {"name": "morphin"}, **over})
 
 
+def costs(*compiled: str, max_steps: int = 8, table_bytes: int = 288) -> Checked:
+    return Checked(tuple(Stage(1 + k, what) for k, what in enumerate(compiled)), max_steps, table_bytes)
+
+
+def size(checked: Checked, workers: int = 2, trials: int = 10_000_000, **over) -> int:
+    return chunk_size(grid(trials=trials, **over), checked, workers)
+
+
 def test_a_trial_costs_something_however_short_it_is() -> None:
-    assert 50 <= chunk_size(grid(), Checked(True, 288)) <= 200
-    assert chunk_size(grid(episodes=1000), Checked(True, 288)) == 32
-    assert chunk_size(grid(episodes=10**9), Checked(True, 288)) == 1
+    assert 800 <= size(costs("passes")) <= 3000
+    assert size(costs("passes"), episodes=10**9) == 1
+
+
+def test_a_chunk_of_a_long_run_is_about_a_second_whatever_is_compiled() -> None:
+    for what, passes_per_second in (("passes", 5e5), ("episodes", 1e5), ("nothing", 1e4)):
+        seconds = size(costs(what), episodes=1000) * 1000 / passes_per_second
+        assert 0.2 <= seconds <= 2.0, what
+
+
+def test_a_chunk_is_as_short_as_the_slowest_of_its_passes_want_it() -> None:
+    assert size(costs("passes", "nothing"), episodes=1000) == size(costs("nothing"), episodes=1000)
+    assert size(costs("nothing", max_steps=100), episodes=1000) < size(costs("nothing"), episodes=1000)
+
+
+def test_each_worker_gets_several_chunks_unless_they_would_be_tiny() -> None:
+    fast = costs("passes")
+    for workers in (1, 2, 16):
+        assert 2000 / size(fast, workers, trials=2000, episodes=1500) >= min(8 * workers, 10)
+    assert size(fast, 16, trials=2000) == size(fast, 16, trials=200) > 100
 
 
 def test_the_q_tables_of_a_chunk_fit_into_a_worker() -> None:
-    assert chunk_size(grid(), Checked(True, 4_000_000)) == 4
-    assert chunk_size(grid(), Checked(True, 400_000_000)) == 1
+    assert size(costs("passes", table_bytes=4_000_000)) == 4
+    assert size(costs("passes", table_bytes=400_000_000)) == 1
 
 
-def test_making_the_parts_tells_how_large_a_table_is() -> None:
-    assert check(grid()) == Checked(compiled=True, table_bytes=4 * 9 * 8)
-    assert not check(grid(execute={"engine": "python"})).compiled
+def test_making_the_parts_tells_how_large_a_table_is_and_how_long_an_episode() -> None:
+    assert check(grid()) == Checked((Stage(1, "passes"),), max_steps=8, table_bytes=4 * 9 * 8)
+
+
+class Plain(PageHinkley):
+    """A detector that declares no rule."""
+
+    Config = None
+
+    def __init__(self):
+        super().__init__(PageHinkleyConfig())
+
+
+def test_making_the_parts_tells_what_is_compiled_and_why_no_more() -> None:
+    plain = {"detectors": [{"name": "page_hinkley"}, {"name": f"{__name__}:Plain"}]}
+    swap = {"pass": 3, "part": "monitor.1", "to": "oracle"}
+    assert check(grid(execute={"engine": "python"})).stages == (Stage(1, "nothing", ("the engine is python",)),)
+    assert check(grid(monitor=plain, swap=[swap])).stages == (
+        Stage(1, "episodes", ("detector monitor.1 Plain declares no rule",)),
+        Stage(3, "passes"),
+    )
+    assert check(grid(monitor=plain, swap=[swap | {"pass": 1}])).stages == (Stage(1, "passes"),)
+
+
+def test_in_processes_only_episodes_are_compiled() -> None:
+    (stage,) = check(grid(), in_processes=True).stages
+    assert stage.compiled == "episodes"
 
 
 @pytest.fixture
