@@ -21,6 +21,9 @@ DOWN, UP, UNKNOWN = 1, 2, 3
 DIRECTIONS: dict[Direction, int] = {"down": DOWN, "up": UP, "unknown": UNKNOWN}
 """Codes of a drift's direction in a row; 0 stands for no drift."""
 
+PASS, PLAN, STEPS, EPSILON, NEXT_EPSILON, SIGNALS = range(6)
+"""Places in a row's head: the first three are integers; from SIGNALS on the signals, the values, the statistics."""
+
 _WORD = (1 << 64) - 1
 
 
@@ -37,6 +40,11 @@ class RowLayout:
         Number of learning-rate parameters in a plan.
     max_actions
         Actions have ids from 0 to ``max_actions - 1``; a set of them is a bit mask of ``ceil(max_actions / 64)`` words.
+
+    Attributes
+    ----------
+    dtype : of a row, as NumPy reads it.
+    head : number of the leading fields that are eight bytes each; what follows differs between few passes.
     """
 
     def __init__(self, signals: tuple[str, ...], detectors: int, rates: int, max_actions: int = 64) -> None:
@@ -44,6 +52,7 @@ class RowLayout:
         self.detectors = detectors
         self.rates = rates
         self.max_actions = max_actions
+        self.head = SIGNALS + len(signals) + 2 * detectors
         words = -(-max_actions // 64)
         hot: list[tuple[str, str, int | None]] = [
             # (name, struct code, how many; None for a scalar): what changes with every pass
@@ -142,13 +151,32 @@ class RowLayout:
         except struct.error as error:
             raise self._misfit(seen, str(error)) from error
 
-    def repeat(
-        self, passed: tuple[Observation, Symptom, ChangeRequest, ChangePlan], count: int
+    def of_heads(
+        self,
+        passed: tuple[Observation, Symptom, ChangeRequest, ChangePlan],
+        heads: npt.NDArray[np.float64],
+        directions: npt.NDArray[np.int64],
     ) -> npt.NDArray[np.void]:
-        """Return `count` rows that all say one pass, to be written over."""
-        row = bytearray(self.struct.size)
-        self.pack_into(row, 0, *passed)
-        return np.frombuffer(row * count, self.dtype)
+        """Return rows with given heads and directions, and all else as in the row of one pass.
+
+        Parameters
+        ----------
+        passed
+            The records of that pass.
+        heads
+            Shape (rows, `head`): what the heads hold, byte for byte.
+        directions
+            Shape (rows, detectors): their codes.
+        """
+        one = bytearray(self.struct.size)
+        self.pack_into(one, 0, *passed)
+        rows = np.empty((len(heads), len(one)), np.uint8)
+        rows[:] = np.frombuffer(one, np.uint8)
+        rows[:, : 8 * self.head] = heads.view(np.uint8)
+        found: npt.NDArray[np.void] = rows.view(self.dtype)[:, 0]
+        if self.detectors:
+            found["direction"] = directions
+        return found
 
     def _misfit(self, seen: Observation, why: str) -> ValueError:
         return ValueError(

@@ -28,8 +28,8 @@ class GridworldParams(NamedTuple):
     Attributes
     ----------
     moves : int64 array, shape (actions, states): the state to which an action leads.
-    goals : int64 array, shape (goals,): states of the goals, in the order in which they take turns.
-    switch_at : int64 array, shape (switches,): episodes from which the next goal holds.
+    goals : int64 array, shape (switches + 1,): state of the active goal in each phase.
+    switch_at : int64 array, shape (switches,): episodes from which the next phase holds.
     start : state in which an episode starts.
     step_reward, goal_reward : reward of a move, and of the move that enters the active goal.
     slip : probability that one of the four moves, drawn uniformly, replaces the chosen action.
@@ -59,7 +59,7 @@ def step(
     if params.slip > 0.0 and draws[at] < params.slip:
         action = int(draws[at + 1] * 4.0)
     landed = int(params.moves[action, state])
-    if landed == int(params.goals[phase % len(params.goals)]):
+    if landed == int(params.goals[phase]):
         return landed, params.goal_reward, True
     return landed, params.step_reward, False
 
@@ -159,7 +159,7 @@ class Gridworld(RulesEnvironment[int]):
         rules = Rules(
             params=GridworldParams(
                 moves=moves,
-                goals=np.array([self._index(goal) for goal in self.goals], np.int64),
+                goals=np.array([self._index(self._goal(phase)) for phase in range(len(self.switch_at) + 1)], np.int64),
                 switch_at=np.array(self.switch_at, np.int64),
                 start=self._index(self.start),
                 step_reward=self.step_reward,
@@ -272,8 +272,11 @@ class Gridworld(RulesEnvironment[int]):
     def _observe(self, state: int) -> int:
         return state
 
+    def _goal(self, phase: int) -> Cell:
+        return self.goals[phase % len(self.goals)]
+
     def _active_goal(self) -> Cell:
-        return self.goals[self._phase % len(self.goals)]
+        return self._goal(self._phase)
 
     def _as_text(self) -> str:
         """Draw one letter a cell: A agent, G active goal, g other goals, # wall."""

@@ -109,11 +109,34 @@ def write_heads(
 ) -> None:
     """Write what stands beside a chunk's rows: its arrays and, last, its results, which say that it is whole."""
     with whole(stem.with_suffix(".npz")) as file:
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(file, allow_pickle=False, **_packed(arrays))
     write_json(
         stem.with_suffix(".json"),
         {"rows": rows, "rows_sha256": rows_sha256, "trials": [r._asdict() for r in results]},
     )
+
+
+def _packed(arrays: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Put the Q-tables of all units one behind the other: an archive of a few entries is written and read at once."""
+    units = [int(name.removeprefix("q_")) for name in arrays if name.startswith("q_")]
+    tables = [arrays[f"q_{unit}"] for unit in units]
+    packed = {
+        "units": np.array(units, dtype=np.int64),
+        "shapes": np.array([table.shape for table in tables], dtype=np.int64).reshape(-1, 2),
+        "values": np.concatenate([np.empty(0), *[table.ravel() for table in tables]]),
+        "actions": np.concatenate([np.empty(0, np.int64), *[arrays[f"actions_{unit}"] for unit in units]]),
+    }
+    return packed | {name: arrays[name] for name in ("trace",) if name in arrays}
+
+
+def _unpacked(packed: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    arrays: dict[str, npt.NDArray[Any]] = {name: packed[name] for name in ("trace",) if name in packed}
+    value = row = 0
+    for unit, (rows, states) in zip(packed["units"].tolist(), packed["shapes"].tolist(), strict=True):
+        arrays[f"q_{unit}"] = packed["values"][value : value + rows * states].reshape(rows, states)
+        arrays[f"actions_{unit}"] = packed["actions"][row : row + rows]
+        value, row = value + rows * states, row + rows
+    return arrays
 
 
 def _break_off(file: IO[bytes], rows: int, target: Path, loops: int = 1) -> None:
@@ -165,7 +188,7 @@ def read_arrays(stem: Path) -> dict[str, npt.NDArray[Any]]:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if found != read_json(stem.with_suffix(".json"))["rows_sha256"]:
         raise ResultsError(f"{rows} was changed after it was written: its SHA-256 is {found}. {again}")
-    return read_npz(stem.with_suffix(".npz"), again)
+    return _unpacked(read_npz(stem.with_suffix(".npz"), again))
 
 
 def remove_parts(folder: Path) -> None:

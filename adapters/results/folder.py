@@ -39,7 +39,8 @@ from mape.errors import ResultsError
 from mape.tables import first_difference
 from mape.trials import TrialResult
 
-FORMAT = 1
+FORMAT = 2
+"""Version of what stands in the folder; an unfinished run of another one is not gone on with."""
 
 BEGUN_BY = ("command", "cwd")
 """Entries of a manifest that do not say what runs: the same run may be gone on with from elsewhere."""

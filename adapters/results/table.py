@@ -53,7 +53,7 @@ COLUMNS: tuple[str, ...] = tuple(name for name in DTYPE.names or () if name != "
 NOISE = ("td_error", "q_change")
 """Columns that are stored as they are: they would take most of the time of packing, and become hardly smaller."""
 
-BLOCK = 65_536
+BLOCK = 8_192
 """Rows that are held in memory at a time."""
 
 
@@ -89,11 +89,13 @@ def write_npz(path: Path, chunks: Iterable[Path], rows: int, skip: int = 0, *, l
 def _write_column(member: IO[bytes], column: str, files: list[Path], rows: int, skip: int) -> None:
     header: dict[str, Any] = {"descr": DTYPE[column].str, "fortran_order": False, "shape": (rows,)}
     np.lib.format.write_array_header_1_0(member, header)
+    buffer = bytearray(BLOCK * DTYPE.itemsize)
+    block = np.frombuffer(buffer, DTYPE)[column]
     for chunk in files:
         with open(chunk, "rb") as file:
             file.seek(skip * DTYPE.itemsize)
-            while len(block := np.fromfile(file, DTYPE, BLOCK)):
-                member.write(block[column].tobytes())
+            while size := file.readinto(buffer):
+                member.write(block[: size // DTYPE.itemsize].tobytes())
 
 
 def read_episodes(path: str | Path, columns: Iterable[str] = COLUMNS) -> dict[str, npt.NDArray[Any]]:

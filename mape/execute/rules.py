@@ -52,7 +52,9 @@ def alpha_star(td_error: float, rate: Floats) -> float:
     >>> round(alpha_star(-1.0, (0.1, 0.99, 5.0)), 12)
     0.116007726866
     """
-    alpha: float = rate[0] + (rate[1] - rate[0]) / (1.0 + math.exp(-(abs(td_error) - rate[2])))
+    alpha: float = rate[0]
+    if rate[1] != alpha:  # else the same would come out; the exponential takes a third of a step
+        alpha += (rate[1] - rate[0]) / (1.0 + math.exp(-(abs(td_error) - rate[2])))
     return alpha
 
 
