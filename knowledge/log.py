@@ -78,6 +78,7 @@ class Log:
         self.passes = 0  # finished passes
         self._window: deque[Pass] = deque(maxlen=window)
         self._unread: deque[Sequence[Pass]] = deque()  # newer than these, and not looked at yet
+        self._unread_passes = 0  # how many they are in all
         self._start: ChangePlan | None = None
         self._open: list[Any] = []  # the records of the pass that is being logged
         self._number = -1  # the pass whose record is expected next; none before plan 0
@@ -139,7 +140,7 @@ class Log:
         self._filled += self._row_size
         passed = _new(Pass, (seen, symptom, request, plan))
         if self._unread:
-            self._unread.append((passed,))
+            self._put_off((passed,))
         else:
             self._window.append(passed)
         self._open = []
@@ -192,20 +193,28 @@ class Log:
             raise ValueError(f"rows of other passes than {self._number} and those after it were sent to the log")
         end = self._filled + rows.nbytes
         if end > len(self._buffer):
-            raise ValueError(f"{len(rows)} rows were sent to a log that has room for {self.room()}")
+            room = (len(self._buffer) - self._filled) // self._row_size
+            raise ValueError(f"{len(rows)} rows were sent to a log that has room for {room}")
         self._buffer[self._filled : end] = rows.tobytes()
         self._filled = end
         self.passes += len(rows)
         self._number += len(rows)
-        self._unread.append(_Unread(rows, read))
-        while sum(map(len, self._unread)) - len(self._unread[0]) >= (self._window.maxlen or 0):
-            self._unread.popleft()
+        self._put_off(_Unread(rows, read))
+
+    def _put_off(self, passed: Sequence[Pass]) -> None:
+        """Keep passes until somebody looks at them, or they have left the window."""
+        self._unread.append(passed)
+        self._unread_passes += len(passed)
+        window = self._window.maxlen or 0
+        while self._unread and self._unread_passes - len(self._unread[0]) >= window:
+            self._unread_passes -= len(self._unread.popleft())
 
     @property
     def window(self) -> deque[Pass]:
         """The newest finished passes, oldest first."""
         while self._unread:
             self._window.extend(self._unread.popleft())
+        self._unread_passes = 0
         return self._window
 
     @property

@@ -19,6 +19,7 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import itertools
 import os
 import platform
 import re
@@ -172,12 +173,22 @@ def cache_folder() -> Path:
     """Return the folder of compiled code: ``$MAPEK_CACHE``, or ``mapek`` in the user's cache folder.
 
     Where neither can be written, a folder in the system's temporary one that belongs to the user alone.
+
+    Raises
+    ------
+    ConfigError
+        None of them can be used.
     """
     named = os.environ.get("MAPEK_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    for folder in (Path(named) if named else Path(base, "mapek"), Path(tempfile.gettempdir(), f"mapek-{os.getuid()}")):
+    fallback = Path(tempfile.gettempdir(), f"mapek-{os.getuid()}")
+    for folder in (Path(named) if named else Path(base, "mapek"), fallback):
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            about = folder.lstat()
+            # Anybody may have made the one with a name that can be guessed, to put code there that we would run.
+            if folder == fallback and (about.st_uid != os.getuid() or about.st_mode & 0o077):
+                continue
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
@@ -250,9 +261,27 @@ def _specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
                 tell(f"compiling {what}: some seconds, once")
         try:
             dispatcher.compile(signature)
-        except numba.core.errors.NumbaError as error:
+        except Exception as error:  # Numba's own, and what it meets while it looks at a rule
             raise ConfigError(
-                f"a rule cannot be compiled by Numba: {str(error).strip().splitlines()[-1]} Choose the engine "
-                "'python' to run it as it is, or keep to what Numba compiles."
+                f"{_why_not(error)} Choose the engine 'python' to run it as it is, or keep to what Numba compiles."
             ) from error
     return dispatcher.overloads[signature].entry_point  # type: ignore[no-any-return]
+
+
+def _why_not(error: Exception) -> str:
+    """Say which rule Numba does not compile, and why, in place of its account of all that it tried."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    names = re.findall(r"Function\(<function (\w+) at ", str(error))
+    rule = f"rule {names[0]}" if names else "a rule"
+    if any(line.startswith(("NRT required", "Only accept returning of array")) for line in lines):
+        return (
+            f"{rule} cannot be compiled by Numba: it makes an array, a list or a text, and compiled rules allocate "
+            "nothing. Let it work in place on the numbers that it is given."
+        )
+    # Each attempt ends in a line of its own that says why; the first that is not about a call tells most.
+    reasons = [after for line, after in itertools.pairwise(lines) if line.endswith(")") and "(step: " in line]
+    calls = [reason for reason in reasons if not reason.startswith("No implementation of function Function(<function ")]
+    why = next(iter(calls or reasons or lines), type(error).__name__)
+    if why.endswith("found for signature:"):
+        why += " " + next((line for line in lines[lines.index(why) :] if line.startswith(">>>")), "")
+    return f"{rule} cannot be compiled by Numba: {why.rstrip('.')}."

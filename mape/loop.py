@@ -200,12 +200,10 @@ class Loop:
         ConfigError
             A rule cannot be compiled; or the engine is 'compiled', and a part declares no rule.
         """
-        if self._stretches is not None and self._stretches.fit:
-            return self._stretches
-        ready = not self.obstacles()
-        self._stretches = (
-            Stretches(self.execute, self.monitor, self.analyze, self.plan, self.knowledge) if ready else None
-        )
+        if self.obstacles():
+            return None
+        if self._stretches is None or not self._stretches.fit:
+            self._stretches = Stretches(self.execute, self.monitor, self.analyze, self.plan, self.knowledge)
         return self._stretches
 
     def obstacles(self) -> list[str]:

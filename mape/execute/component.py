@@ -105,7 +105,6 @@ class Execute:
             self._begun = 1
         self._take_actions(first, 1)
         self._set_table(QTable(first, system.n_states))
-        self._drive = self._bound(learner)
         knowledge.serve_q_table(lambda: self.q_table.copy())
 
     def record_trace(self, first: int, last: int, listener: Callable[[int, npt.NDArray[np.float64]], object]) -> None:
@@ -174,15 +173,19 @@ class Execute:
             self._workspace.roll_back()
             if isinstance(error, MapekError) or not isinstance(error, Exception):
                 raise
+            if (steps := int(self._workspace.used[1])) < 0:
+                raise self._failed_to_reset(error, number) from error
             raise ManagedSystemError(
-                f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step "
-                f"{int(self._workspace.used[1]) + 1}. Nothing of that episode was learnt; the {self.passes} passes "
-                "before it stand in the log."
+                f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step {steps + 1}. "
+                f"Nothing of that episode was learnt; the {self.passes} passes before it stand in the log."
             ) from error
         if status != episode.OK:
             self._workspace.roll_back()
             raise refused(status, self.system, number, steps, (total, td_error, change))
-        signals = {"return": total, "steps": float(steps), "td_error": td_error, "q_change": change}
+        # NumPy's floats, with which the plain episode computes, would warn where the sums of a detector overflow.
+        signals = {
+            "return": float(total), "steps": float(steps), "td_error": float(td_error), "q_change": float(change)
+        }  # fmt: skip
         if self._own_signals:
             self._add_own_signals(signals, number)
         if tracing and self.trace is not None:
@@ -190,26 +193,31 @@ class Execute:
         self.observe(steps, signals)
 
     def observe(self, steps: int, signals: dict[str, float]) -> None:
-        """Send the Observation of the next pass, whose episode is driven."""
+        """Send the Observation of the next pass, whose episode is driven; if it is not taken, nothing was learnt."""
         plan = self.plan
         assert plan is not None
         self.passes += 1
-        self._send(
-            _new(
-                Observation,
-                (
-                    self._loop,
-                    self.passes,
-                    plan.pass_no,
-                    plan.epsilon,
-                    plan.reset_detector,
-                    steps,
-                    self.available,
-                    self.q_table.actions,
-                    signals,
-                ),
+        try:
+            self._send(
+                _new(
+                    Observation,
+                    (
+                        self._loop,
+                        self.passes,
+                        plan.pass_no,
+                        plan.epsilon,
+                        plan.reset_detector,
+                        steps,
+                        self.available,
+                        self.q_table.actions,
+                        signals,
+                    ),
+                )
             )
-        )
+        except BaseException:  # a listener of rows that raised, say: the pass is still to be made
+            self.passes -= 1
+            self._workspace.roll_back()
+            raise
 
     def quiet_until(self, last: int) -> int:
         """Return the pass, `last` at most, up to which all episodes are alike.
@@ -332,12 +340,15 @@ class Execute:
         except MapekError:
             raise
         except Exception as error:
-            raise ManagedSystemError(
-                f"{self.system.name} raised {type(error).__name__}: {error}, at the reset of episode {number}. The "
-                f"{self.passes} passes before it stand in the log."
-            ) from error
+            raise self._failed_to_reset(error, number) from error
         # One object as long as nothing changes: what compares by identity is cheap downstream.
         return self.available if available == self.available else available
+
+    def _failed_to_reset(self, error: Exception, number: int) -> ManagedSystemError:
+        return ManagedSystemError(
+            f"{self.system.name} raised {type(error).__name__}: {error}, at the reset of episode {number}. The "
+            f"{self.passes} passes before it stand in the log."
+        )
 
     def _take_actions(self, available: tuple[int, ...], number: int) -> None:
         check_offer(available, self.system, number, self._max_actions)
@@ -358,6 +369,8 @@ class Execute:
         self._workspace.open(table)
         self._knowledge.actions = table.actions
         self._set_rows()
+        # A table of a single row has another type in compiled code than one of several.
+        self._drive = self._bound(self.learner)
 
     def _set_rows(self) -> None:
         if not self._workspace.offer(self.available):

@@ -64,7 +64,7 @@ def episode(
         Values and stamps, shape (rows, states). A pair whose stamp is not `number` is saved before its first update.
     journal, saved, used
         The undo journal: flat index and old value of each touched pair; ``used[0]`` is its length, ``used[1]`` the
-        number of steps. They are valid even if a rule raises.
+        number of steps, -1 before the first state. They are valid even if a rule raises.
     rows, choices
         The rows that may be used, and as much working space.
     actions
@@ -81,7 +81,7 @@ def episode(
         them as they are, one of them not finite.
     """
     used[0] = 0
-    used[1] = 0
+    used[1] = -1
     for k in range(len(context)):
         context[k] = 0.0
     n_states = q.shape[1]
@@ -92,6 +92,7 @@ def episode(
     total = 0.0
     total_td = 0.0
     phase, state = begin(system, number, draws, at)
+    used[1] = 0
     if not 0 <= state < n_states:
         return OFF_TABLE, 0, float(state), -1.0, 0.0
     steps = 0

@@ -55,6 +55,7 @@ def two_window_alarm(state: list[float], params: tuple[float, ...], x: float) ->
     taken += 1
     state[1] = taken
     if taken < length:
+        state[0] = math.nan  # what shorter windows gave, whose values these are, is no reading of this test
         return False, math.nan, UNKNOWN
     # Sums are taken relative to the oldest value: squares of large offsets would cancel.
     origin = state[2 + taken % length]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from knowledge.rows import DOWN, EPSILON, NEXT_EPSILON, PASS, PLAN, SIGNALS, STEPS, UNKNOWN
 from mape.execute.episode import OK
 from mape.execute.rules import Floats, Ints
 
@@ -36,8 +37,8 @@ def passes(
     at: int,
     width: int,
     told: Ints,
-    numbers: Floats,
-    statistics: Floats,
+    heads: Floats,
+    integers: Ints,
     directions: Ints,
     state: Floats,
     before: Floats,
@@ -76,9 +77,12 @@ def passes(
     told
         Shape (2,), written: what ended the stretch, and the number of passes that are finished; valid even if a rule
         raised, and the status is then BROKEN.
-    numbers, statistics, directions
-        Written, a row for each pass: epsilon of the pass, of the next one, and the signals; what each detector reads,
-        and the side it names. Shapes (at least count, 2 + signals) and (at least count, detectors).
+    heads, integers
+        Written: for each pass the head of its row in the log (`knowledge.rows`), shape (more than count, width); the
+        latter is the same memory, seen as integers. Behind the passes that are finished stands that which ended them.
+        The last row is given: in it stands which detectors have a statistic before the first pass, NaN for none.
+    directions
+        Written: the side that each detector names, shape (at least count, detectors).
     state, before, params
         The numbers of all parts, one after the other; `before` is working space of the same length as `state`.
     bounds
@@ -88,6 +92,8 @@ def passes(
     What follows is `mape.execute.episode.episode`'s.
     """
     told[FINISHED] = 0
+    after_signals = SIGNALS + 4 + len(context)
+    detectors = directions.shape[1]
     for i in range(count):
         told[STATUS] = BROKEN
         for k in range(len(state)):
@@ -98,7 +104,7 @@ def passes(
         )  # fmt: skip
         if status != OK:
             return
-        signals = numbers[i, 2:]
+        signals = heads[i, SIGNALS:after_signals]
         signals[0] = total
         signals[1] = steps
         signals[2] = td_error
@@ -107,7 +113,8 @@ def passes(
             signals[4 + k] = context[k]
             if not math.isfinite(context[k]):
                 return
-        quiet = sense(2, signals, state, params, bounds, statistics[i], directions[i])
+        last, readings = heads[i - 1, after_signals:], heads[i, after_signals:]
+        quiet = sense(0, detectors, signals, state, params, bounds, last, readings, directions[i])
         if quiet:
             quiet = not changed(
                 state[bounds[1, 0] : bounds[1, 1]], params[bounds[1, 2] : bounds[1, 3]], signals
@@ -121,8 +128,11 @@ def passes(
                 state[k] = before[k]
             told[STATUS] = HANDED_OVER
             return
-        numbers[i, 0] = epsilon
-        numbers[i, 1] = following
+        integers[i, PASS] = first + i
+        integers[i, PLAN] = first + i - 1
+        integers[i, STEPS] = steps
+        heads[i, EPSILON] = epsilon
+        heads[i, NEXT_EPSILON] = following
         epsilon = following
         at += width
         told[FINISHED] = i + 1
@@ -130,22 +140,45 @@ def passes(
 
 
 def sense_none(
-    k: int, signals: Floats, state: Floats, params: Floats, bounds: Ints, statistics: Floats, directions: Ints
+    k: int,
+    count: int,
+    signals: Floats,
+    state: Floats,
+    params: Floats,
+    bounds: Ints,
+    last: Floats,
+    readings: Floats,
+    directions: Ints,
 ) -> bool:
     """Say that no detector alarms, where there is none."""
     return True
 
 
 def sense_each(
-    k: int, signals: Floats, state: Floats, params: Floats, bounds: Ints, statistics: Floats, directions: Ints
+    k: int,
+    count: int,
+    signals: Floats,
+    state: Floats,
+    params: Floats,
+    bounds: Ints,
+    last: Floats,
+    readings: Floats,
+    directions: Ints,
 ) -> bool:
-    """Feed detector number k - 2 and those after it; say whether all of them are quiet."""
-    alarm, statistic, direction = detector(
-        state[bounds[k, 0] : bounds[k, 1]], params[bounds[k, 2] : bounds[k, 3]], signals[bounds[k, 4]]
-    )
-    statistics[k - 2] = statistic
-    directions[k - 2] = direction
-    if alarm or math.isinf(statistic):
+    """Feed detector number `k` of `count`, and those after it; say whether all of them are quiet.
+
+    Their values and then their statistics are written to `readings`, as those of the pass before stand in `last`. One
+    that loses its statistic is not quiet: whether it has none from then on, or NaN by a fault, its own methods tell.
+    """
+    begin, end, begin_params, end_params, column = bounds[2 + k]
+    x = signals[column]
+    alarm, statistic, direction = detector(state[begin:end], params[begin_params:end_params], x)
+    readings[k] = x
+    readings[count + k] = math.nan if math.isnan(statistic) else statistic  # of all that are NaN, one
+    directions[k] = direction
+    if alarm or math.isinf(statistic) or not DOWN <= direction <= UNKNOWN:
         return False
-    quiet: bool = others(k + 1, signals, state, params, bounds, statistics, directions)
+    if math.isnan(statistic) and not math.isnan(last[count + k]):
+        return False
+    quiet: bool = others(k + 1, count, signals, state, params, bounds, last, readings, directions)
     return quiet

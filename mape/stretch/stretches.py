@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from knowledge import ChangePlan, ChangeRequest, Knowledge, Observation, Reading, Symptom
+from knowledge import ChangePlan, ChangeRequest, Knowledge, Observation, QTable, Reading, Symptom
 from knowledge.log import Pass
-from knowledge.rows import DIRECTIONS, UNKNOWN
+from knowledge.rows import DIRECTIONS, NEXT_EPSILON, SIGNALS, UNKNOWN
 from mape.analyze import Analyze
 from mape.compose import Composed, Rule, specialise
 from mape.execute import Execute
 from mape.execute.binding import composed
 from mape.monitor import Monitor
 from mape.plan import Plan
-from mape.ports import QuietRule
+from mape.ports import Detector, QuietRule
 from mape.stretch import passes
 from mape.stretch.quiet import obstacle, quiet_of
 
@@ -61,26 +61,27 @@ class Stretches:
         self._watched = tuple(name for name, _ in monitor.detectors)
         self._parts = self._present()
         rules = self._rules()
+        self._forms = _forms(rules)
         names = self._log.layout.signals
         columns = [names.index(name) for name in self._watched]
-        self._at_values = [2 + column for column in columns]
         self._bounds = _bounds(rules, columns)
         self._state = np.zeros(max(1, int(self._bounds[-1, 1])))
         self._before = np.zeros_like(self._state)
         self._params = np.zeros(max(1, int(self._bounds[-1, 3])))
         self._told = np.zeros(2, dtype=np.int64)
         most = len(execute.uniforms.values) // execute.uniforms.width
-        self._numbers = np.zeros((most, 2 + len(names)))
-        self._statistics = np.full((most, len(self._watched)), math.nan)
+        self._heads = np.zeros((most + 1, self._log.layout.head))
+        self._integers = self._heads.view(np.int64)
         self._directions = np.zeros((most, len(self._watched)), dtype=np.int64)
         assert execute.rules is not None
-        dispatcher = _compiled(composed(execute.rules, execute.learner), *(rule.function for rule in rules))
-        self._passes = specialise(dispatcher, self._arguments(1, 1, 0.5, 0), "the passes of such a loop")
+        self._bound = _compiled(composed(execute.rules, execute.learner), *(rule.function for rule in rules))
+        self._take(execute.q_table)
 
     @property
     def fit(self) -> bool:
-        """Whether the parts are still those for which these passes were compiled."""
-        return all(now is then for now, then in zip(self._present(), self._parts, strict=True))
+        """Whether the parts, and the rules that they declare, are still those for which these passes were compiled."""
+        same = all(now is then for now, then in zip(self._present(), self._parts, strict=True))
+        return same and _forms(self._rules()) == self._forms
 
     def run(self, until: int) -> bool:
         """Make passes up to number `until`, as long as they are quiet.
@@ -93,66 +94,87 @@ class Stretches:
         execute = self._execute
         if not self._plan.answered:
             return False  # what a planner repeats in a quiet pass, it has said at least once
+        if self._log.passes != execute.passes:
+            return False  # a part failed at the newest pass: the log says what is missing
+        if execute.q_table is not self._table:
+            self._take(execute.q_table)
         while execute.passes < until:
+            room = self._log.room()  # asked first: a listener that hears of rows then may want traces
             count = execute.quiet_until(until) - execute.passes
             if count < 1:
                 return False
             at = execute.uniforms.find(execute.passes)
             blocks = (len(execute.uniforms.values) - at) // execute.uniforms.width
-            status = self._make(min(count, blocks, self._log.room()), at)
+            status = self._make(min(count, blocks, room), at)
             if status == passes.BROKEN:
                 return False
             if status == passes.HANDED_OVER:
-                numbers = self._numbers[int(self._told[passes.FINISHED]), 2:].tolist()
-                execute.observe(int(numbers[1]), dict(zip(self._log.layout.signals, numbers, strict=True)))
+                names = self._log.layout.signals
+                signals = self._heads[int(self._told[passes.FINISHED]), SIGNALS : SIGNALS + len(names)].tolist()
+                execute.observe(int(signals[1]), dict(zip(names, signals, strict=True)))
                 return True
         return True
 
+    def _take(self, table: QTable) -> None:
+        self._table = table  # one of a single row has another type in compiled code than one of several
+        self._passes = specialise(self._bound, self._arguments(1, 1, 0.5, 0), "stretches of passes with these parts")
+
     def _make(self, count: int, at: int) -> int:
-        """Make at most `count` passes, and log those that are finished; return what ended them."""
+        """Make at most `count` passes, and log those that are finished; return what ended them.
+
+        What is raised meanwhile by nobody's rule, such as a KeyboardInterrupt, is raised when that is done.
+        """
         execute, first = self._execute, self._execute.passes + 1
         plan = execute.plan
         assert plan is not None
         rules = self._rules()
+        if _forms(rules) != self._forms:
+            return passes.BROKEN  # a part put another rule, or more or fewer numbers, in the place of its own
         self._state[: self._bounds[-1, 1]] = [number for rule in rules for number in rule.state]
         self._params[: self._bounds[-1, 3]] = [number for rule in rules for number in rule.params]
+        for k, (_, detector) in enumerate(self._monitor.detectors, -len(self._watched)):
+            self._heads[-1, k] = math.nan if _has_none(detector) else 0.0
+        raised: BaseException | None = None
+        self._told[:] = (passes.DONE, 0)  # what holds if not even the first one is begun
         try:
             self._passes(*self._arguments(first, count, plan.epsilon, at))
-        except Exception:  # a rule raised: the components make this pass again, and say which
-            self._state[:] = self._before
+        except BaseException as error:
+            raised = error
         status, finished = self._told.tolist()
         if status == passes.BROKEN:
+            self._state[:] = self._before
+            if isinstance(raised, Exception):
+                raised = None  # a rule's: the components make this pass again, and say which
+        if status == passes.BROKEN or (status == passes.HANDED_OVER and raised is not None):
             execute.roll_back()
         numbers = self._state.tolist()
         for rule, (begin, end) in zip(rules, self._bounds[:, :2].tolist(), strict=True):
             rule.state[:] = numbers[begin:end]
         if finished:
             self._keep(first, finished, plan.learning_rate)
+        if raised is not None:
+            raise raised
         return int(status)
 
     def _keep(self, first: int, count: int, rate: tuple[float, ...]) -> None:
         execute, layout = self._execute, self._log.layout
         newest = ChangePlan(
-            self._log.loop, first + count - 1, float(self._numbers[count - 1, 1]), rate, (), (), (), False, None
+            self._log.loop,
+            first + count - 1,
+            float(self._heads[count - 1, NEXT_EPSILON]),
+            rate,
+            (),
+            (),
+            (),
+            False,
+            None,
         )
         execute.follow(newest)
         self._plan.follow(newest)
         quiet = functools.partial(
             _quiet_pass, self._log.loop, layout.signals, self._watched, execute.available, execute.q_table.actions, rate
         )
-        numbers = self._numbers[:count]
-        rows = layout.repeat(quiet(first), count)
-        rows["pass"] = np.arange(first, first + count)
-        rows["plan"] = rows["pass"] - 1
-        rows["epsilon"] = numbers[:, 0]
-        rows["next_epsilon"] = numbers[:, 1]
-        rows["steps"] = numbers[:, 3]
-        rows["signals"] = numbers[:, 2:]
-        if self._watched:
-            rows["value"] = numbers[:, self._at_values]
-            statistics = self._statistics[:count]
-            rows["statistic"] = np.where(np.isnan(statistics), math.nan, statistics)  # of all that are NaN, one
-            rows["direction"] = self._directions[:count]
+        rows = layout.of_heads(quiet(first), self._heads[:count], self._directions[:count])
         self._log.extend(rows, lambda row: quiet(*_of_row(row)))
 
     def _present(self) -> tuple[Any, ...]:
@@ -174,8 +196,8 @@ class Stretches:
             at,
             self._execute.uniforms.width,
             self._told,
-            self._numbers,
-            self._statistics,
+            self._heads,
+            self._integers,
             self._directions,
             self._state,
             self._before,
@@ -193,6 +215,19 @@ def _compiled(drive: Composed, explore: Rule, changed: Rule, *detectors: Rule) -
         sense = Composed(passes.sense_each, {"detector": detector, "others": sense})
     bound = {"drive": drive, "sense": sense, "changed": changed, "explore": explore}
     return Composed(passes.passes, bound).compiled()
+
+
+def _forms(rules: Sequence[QuietRule]) -> list[tuple[Rule, int, int]]:
+    """Return what is fixed of rules: which they are, and how many numbers they have."""
+    return [(rule.function, len(rule.state), len(rule.params)) for rule in rules]
+
+
+def _has_none(detector: Detector) -> bool:
+    """Whether a detector has no statistic; one that cannot say so before its first value may have one."""
+    try:
+        return detector.statistic is None
+    except Exception:  # it is read after each value, and what it raises then is told
+        return False
 
 
 def _bounds(rules: Sequence[QuietRule], columns: Sequence[int]) -> npt.NDArray[np.int64]:

@@ -1,4 +1,5 @@
 import hashlib
+import itertools
 
 import numpy as np
 import pytest
@@ -7,7 +8,8 @@ from hypothesis import strategies as st
 from knowledge_strategies import one_pass, plan
 
 import knowledge.log
-from knowledge import Ack, ChangePlan, ChangeRequest, Log, Observation, RowLayout, Symptom
+from knowledge import STAGES, Ack, ChangePlan, ChangeRequest, Log, Observation, RowLayout, Symptom
+from knowledge.log import Pass
 
 
 def fresh(window=256):
@@ -340,3 +342,157 @@ def test_the_last_row_is_that_of_the_newest_finished_pass_whether_it_was_handed_
     log.flush()
     log.append(one_pass(2)[0])
     assert log.last_row() == row
+
+
+def of_row(row):
+    number = int(row["pass"])
+    return Pass(*one_pass(number, alarm=number % 5 == 0))
+
+
+def packed(first, count):
+    """The rows of `count` passes from number `first` on."""
+    rows = rows_of(first + count - 1)[first - 1 :]
+    return np.frombuffer(b"".join(rows), fresh().layout.dtype)
+
+
+deeds = st.one_of(
+    st.tuples(st.just("rows"), st.integers(0, 9)),
+    st.tuples(st.just("rows"), st.integers(0, 9)),
+    st.tuples(st.just("records"), st.integers(1, 9)),
+    st.tuples(st.just("look"), st.integers(-1, 60)),
+    st.tuples(st.just("flush"), st.just(0)),
+    st.tuples(st.just("listen"), st.just(0)),
+)
+
+
+@given(st.lists(deeds, max_size=20), st.sampled_from([0, 1, 4, 256]), st.sampled_from([1, 3, 16, 512]))
+def test_a_log_of_rows_and_records_is_the_log_of_records_alone(todo, window, segment):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(knowledge.log, "SEGMENT", segment)
+        mixed, plain = fresh(window), fresh(window)
+    heard = ([], [])
+
+    def listen():
+        for log, told in zip((mixed, plain), heard, strict=True):
+            log.on_rows(lambda rows, own=told: own.append(rows.tobytes()))
+
+    listen()
+    run = iter(run_of(200))
+    for log in (mixed, plain):
+        log.append(plan(0))
+    assert next(run) == plan(0)
+    for deed, number in todo:
+        if deed == "rows":
+            for record in () if not mixed.open_records else itertools.islice(run, 4 - len(mixed.open_records)):
+                assert mixed.append(record) is plain.append(record) is Ack.OK
+            count = min(number, mixed.room())
+            if plain.passes + count > 199:
+                break
+            mixed.extend(packed(mixed.passes + 1, count), of_row)
+            for record in itertools.islice(run, 4 * count):
+                plain.append(record)
+        elif deed == "records":
+            for record in itertools.islice(run, number):
+                assert mixed.append(record) is plain.append(record) is Ack.OK
+        elif deed == "look":
+            for kind in STAGES:
+                assert mixed.find(kind, number) == plain.find(kind, number)
+            from_there = max(0, number)
+            if from_there > plain.passes - min(window, plain.passes):
+                assert list(mixed.since(from_there, 1)) == list(plain.since(from_there, 1))
+        elif deed == "flush":
+            mixed.flush()
+            plain.flush()
+        else:
+            listen()
+        assert (mixed.sha256(), mixed.passes, mixed.last_row()) == (plain.sha256(), plain.passes, plain.last_row())
+    sent_again = one_pass(max(1, mixed.passes), alarm=max(1, mixed.passes) % 5 == 0)[1]
+    assert mixed.append(sent_again) is plain.append(sent_again)
+    assert states(mixed) == states(plain)
+    for log in (mixed, plain):
+        log.flush()
+    assert heard[0] == heard[1]
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        (lambda: packed(4, 2), "rows of other passes than 5"),
+        (lambda: packed(6, 2), "rows of other passes than 5"),
+        (lambda: packed(5, 3)[::2], "rows of other passes than 5"),
+        (lambda: packed(5, 2)[::-1], "rows of other passes than 5"),
+        (lambda: np.zeros(1, Log(RowLayout(("cost",), 1, 2)).layout.dtype), "rows of other passes than 5"),
+        (lambda: packed(5, 5), "5 rows were sent to a log that has room for 4"),
+    ],
+)
+def test_rows_that_do_not_come_next_are_refused_and_change_nothing(monkeypatch, rows, says):
+    monkeypatch.setattr(knowledge.log, "SEGMENT", 8)
+    heard = []
+    log = filled(4, listener=lambda segment: heard.append(len(segment)))
+    before = states(log)
+    with pytest.raises(ValueError, match=says):
+        log.extend(rows(), of_row)
+    assert (states(log), heard) == (before, [])
+    log.extend(packed(5, 4), of_row)
+    assert states(log) == states(filled(8))
+
+
+def test_a_full_log_that_is_sent_rows_refuses_them_and_does_not_hand_on_what_it_has(monkeypatch):
+    monkeypatch.setattr(knowledge.log, "SEGMENT", 4)
+    heard = []
+    log = filled(4, listener=lambda segment: heard.append(len(segment)))
+    with pytest.raises(ValueError, match="1 rows were sent to a log that has room for 0"):
+        log.extend(packed(5, 1), of_row)
+    assert heard == []
+    assert log.room() == 4
+    assert heard == [4]
+
+
+def test_rows_are_no_part_of_a_pass_that_is_begun_nor_of_a_log_without_plan_0():
+    log = filled(2)
+    log.append(one_pass(3)[0])
+    before = states(log)
+    for number in (3, 4):
+        with pytest.raises(ValueError, match="rows of other passes"):
+            log.extend(packed(number, 1), of_row)
+    assert states(log) == before
+    with pytest.raises(ValueError, match="rows of other passes"):
+        fresh().extend(packed(1, 1), of_row)
+
+
+@pytest.mark.parametrize("after", ["rows", "records"])
+def test_rows_that_have_left_the_window_are_let_go_unread(after):
+    log, read = filled(0, window=4), []
+
+    def reading(row):
+        read.append(int(row["pass"]))
+        return of_row(row)
+
+    log.extend(packed(1, 6), reading)
+    if after == "rows":
+        log.extend(packed(7, 5), reading)
+    else:
+        for record in run_of(11)[1 + 4 * 6 :]:
+            log.append(record)
+    assert [finished.observation.pass_no for finished in log.window] == [8, 9, 10, 11]
+    assert 1 not in read
+
+
+def test_a_listener_that_fails_when_room_is_asked_for_is_offered_the_segment_again(monkeypatch):
+    monkeypatch.setattr(knowledge.log, "SEGMENT", 4)
+    heard, fails = [], [True]
+
+    def hear(rows):
+        if fails.pop():
+            fails.append(False)
+            raise OSError("disk full")
+        fails.append(False)
+        heard.extend(rows["pass"].tolist())
+
+    log = filled(0, listener=hear)
+    log.extend(packed(1, 4), of_row)
+    with pytest.raises(OSError, match="disk full"):
+        log.room()
+    before = log.sha256()
+    assert log.room() == 4
+    assert (heard, log.sha256()) == ([1, 2, 3, 4], before)

@@ -4,8 +4,11 @@ from hypothesis import strategies as st
 
 EPISODES = 8
 
-episode = st.integers(1, EPISODES)
-switches = st.lists(st.integers(2, EPISODES), unique=True, max_size=3).map(sorted)
+
+def switches(episodes=EPISODES):
+    return st.lists(st.integers(2, episodes), unique=True, max_size=3).map(sorted)
+
+
 unit = st.sampled_from([0.0, 0.1, 0.5, 0.99, 1.0]) | st.floats(0, 1)
 rate = st.sampled_from([0.1, 0.5, 1.0])
 
@@ -26,7 +29,7 @@ detectors = st.lists(
                 "threshold": st.floats(0.5, 3),
             }
         ),
-        st.fixed_dictionaries({"name": st.just("oracle"), "episodes": switches}),
+        st.fixed_dictionaries({"name": st.just("oracle"), "episodes": switches()}),
         st.just({"name": "page_hinkley", "signal": "td_error", "threshold": 0.1}),
     ),
     max_size=2,
@@ -51,42 +54,46 @@ def planners(draw, reserve=()):
 
 
 @st.composite
-def gridworlds(draw):
+def gridworlds(draw, episodes=EPISODES):
     size = draw(st.tuples(st.integers(1, 6), st.integers(2, 6)))
     cell = st.tuples(st.integers(0, size[0] - 1), st.integers(0, size[1] - 1))
     places = draw(st.lists(cell, unique=True, min_size=2, max_size=7))
     goals = places[1 : draw(st.integers(2, min(len(places), 3)))]
-    jump_from = draw(st.none() | episode)
+    jump_from = draw(st.none() | st.integers(1, episodes))
     removable = st.integers(0, 3 if jump_from is None else 7)
     options = {
         "size": size,
         "start": places[0],
         "goals": goals,
-        "switch_at": draw(switches) if len(goals) > 1 else [],
+        "switch_at": draw(switches(episodes)) if len(goals) > 1 else [],
         "walls": places[1 + len(goals) :],
         "max_steps": draw(st.integers(1, 25)),
         "slip": draw(st.sampled_from([0.0, 0.3])),
         "jump_from": jump_from,
-        "remove": draw(st.dictionaries(removable.map(str), st.integers(2, EPISODES + 2), max_size=3)),
+        "remove": draw(st.dictionaries(removable.map(str), st.integers(2, episodes + 2), max_size=3)),
         "step_reward": draw(st.sampled_from([-1.0, 0.0, 0.3])),
     }
     return {"id": "mapek/Gridworld-v0", "options": {k: v for k, v in options.items() if v is not None}}, ()
 
 
 @st.composite
-def junctions(draw):
-    changes = draw(switches)
+def junctions(draw, episodes=EPISODES):
+    changes = draw(switches(episodes))
+    services = draw(st.sampled_from([((5, 2), (2, 5), (3, 3)), ((4, 4),)]))
     rates = st.tuples(st.floats(0, 12), st.floats(0, 12))
     options = {
         "capacity": draw(st.integers(3, 10)),
         "max_steps": draw(st.integers(1, 20)),
+        "services": services,
         "switch_at": changes,
         "rates": draw(st.lists(rates, min_size=len(changes) + 1, max_size=len(changes) + 1)),
     }
-    reserve_from = draw(st.none() | episode)
+    reserve_from = draw(st.none() | st.integers(1, episodes))
     if reserve_from is not None:
         options["reserve_from"] = reserve_from
-    return {"id": "mapek/TrafficJunction-v0", "options": options}, draw(st.sampled_from([(), (3, 4), (4,)]))
+    return {"id": "mapek/TrafficJunction-v0", "options": options}, draw(
+        st.sampled_from([(), (len(services), len(services) + 1), (len(services) + 1,)])
+    )
 
 
 @st.composite

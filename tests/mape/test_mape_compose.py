@@ -2,13 +2,17 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import textwrap
+from pathlib import Path
 
+import composed_rules
 import numpy as np
 import pytest
+from composed_rules import below, both, less, root, scaled
 from mape_runs import GRID, config, hashes, loop_of
 
-from mape.compose import Composed, specialise
+from mape.compose import Composed, cache_folder, specialise
 from mape.errors import ConfigError
 from mape.execute.rules import alpha_star, expected_value, max_value
 from mape.testing.learners import probe
@@ -148,3 +152,180 @@ def test_a_constant_that_is_imported_and_edited_is_seen(tmp_path):
     assert fresh_process(tmp_path, RUN).split()[0].strip("[,") == "6.0"
     (tmp_path / "a_constant.py").write_text("STEP = 50.0\nTABLE = (1, 2)\n")
     assert fresh_process(tmp_path, RUN).split()[0].strip("[,") == "55.0"
+
+
+def scaled_by(rule, **options):
+    return Composed(scaled, {"rule": rule}, **options)
+
+
+BOUND = {
+    "one rule": scaled_by(root),
+    "one template twice": Composed(both, {"first": scaled_by(root), "second": scaled_by(less)}),
+    "one binding twice": Composed(both, {"first": scaled_by(root), "second": scaled_by(root)}),
+    "one within another": scaled_by(Composed(both, {"first": scaled_by(below), "second": below})),
+    "one apart": Composed(both, {"first": scaled_by(root, apart=True), "second": less}),
+    "both apart": Composed(both, {"first": scaled_by(root, apart=True), "second": scaled_by(less, apart=True)}),
+    "apart from what is apart": scaled_by(
+        Composed(both, {"first": scaled_by(below, apart=True), "second": scaled_by(root)}, apart=True)
+    ),
+    "itself apart": scaled_by(less, apart=True),
+}
+
+
+@pytest.mark.parametrize("bound", BOUND)
+def test_bindings_of_bindings_are_the_same_compiled_and_plain(bound):
+    plain, compiled = BOUND[bound].python(), specialise(BOUND[bound].compiled(), (1.0,), "it")
+    for x in (-3.5, 0.0, 0.1, 7.0, 1e300):
+        assert compiled(x) == plain(x)
+
+
+def test_what_is_apart_has_a_module_of_its_own_from_which_others_import_it():
+    apart = scaled_by(root, apart=True)
+    others = [Composed(both, {"first": apart, "second": less}), Composed(both, {"first": less, "second": apart})]
+    for other in others:
+        assert f"from {apart.compiled().py_func.__module__} import scaled as both__" in other.source()
+        assert "SCALE" not in other.source()
+
+
+def test_two_templates_that_mean_different_things_by_one_name_are_told_apart(tmp_path):
+    (tmp_path / "a_rule.py").write_text("SCALE = 3.0\n\n\ndef rule(x):\n    return x\n")
+    (tmp_path / "a_template.py").write_text(
+        "from a_rule import SCALE\n\n\ndef template(x):\n    return SCALE * inner(x)\n"
+    )
+    text = f"""
+        import sys
+        sys.path.append({str(Path(__file__).parent)!r})
+        from a_template import template
+        from composed_rules import root, scaled
+        from mape.compose import Composed
+        from mape.errors import ConfigError
+
+        try:
+            Composed(template, {{"inner": Composed(scaled, {{"rule": root}})}}).compiled()
+        except ConfigError as error:
+            print(error)
+    """
+    assert fresh_process(tmp_path, text) == "two templates mean different things by 'SCALE'; rename one\n"
+
+
+@pytest.mark.parametrize(
+    ("rule", "why"),
+    [
+        *[
+            (name, "it makes an array, a list or a text, and compiled rules allocate nothing. Let it work in place on")
+            for name in ("makes_an_array", "makes_zeros", "makes_a_list", "makes_a_text")
+        ],
+        (
+            "adds_a_text",
+            "No implementation of function Function(<built-in function add>) found for signature: >>> add(",
+        ),
+        ("sums_a_generator", "The use of yield in a closure is unsupported. Choose the engine 'python' to run it as"),
+    ],
+)
+def test_a_rule_that_numba_does_not_compile_is_named_with_the_reason_and_the_way_out(rule, why):
+    with pytest.raises(ConfigError) as refused:
+        specialise(scaled_by(getattr(composed_rules, rule)).compiled(), (1.0,), "it")
+    assert str(refused.value).startswith(f"rule {rule} cannot be compiled by Numba: {why}")
+    assert str(refused.value).endswith("Choose the engine 'python' to run it as it is, or keep to what Numba compiles.")
+
+
+def test_the_reason_is_that_of_the_rule_which_is_called_by_the_one_that_is_named():
+    with pytest.raises(ConfigError, match=r"^rule calls_another cannot be compiled.*<built-in function add>.*>>> add"):
+        specialise(scaled_by(composed_rules.calls_another).compiled(), (1.0,), "it")
+
+
+def test_a_name_that_numpy_does_not_have_is_refused_too():
+    with pytest.raises(ConfigError, match=r"cannot be compiled by Numba: module 'numpy' has no attribute 'median_of_"):
+        specialise(scaled_by(composed_rules.asks_numpy).compiled(), (1.0,), "it")
+
+
+def test_a_detector_whose_rule_allocates_is_refused_before_the_first_pass():
+    loop = loop_of(config(monitor={"detectors": ["stretch_parts:Allocating"]}))
+    with pytest.raises(ConfigError, match=r"^rule allocates cannot be compiled by Numba: it makes an array"):
+        loop.run(1)
+    assert loop.log.passes == 0
+    plain = loop_of(config(monitor={"detectors": ["stretch_parts:Allocating"]}, execute={"engine": "python"}))
+    plain.run(10)
+    assert plain.log.passes == 10
+
+
+WATCH = """
+import math
+from knowledge.rows import UNKNOWN
+from mape.ports import QuietRule
+
+
+def watch(state, params, x):
+    state[0] = 0.5 * state[0] + x
+    return False, state[0], UNKNOWN
+
+
+class Watch:
+    direction = "unknown"
+    quiet = property(lambda self: QuietRule(watch, self.numbers))
+    statistic = property(lambda self: self.numbers[0])
+
+    def __init__(self):
+        self.numbers = [0.0]
+
+    def update(self, x):
+        return watch(self.numbers, (), x)[0]
+
+    def reset(self):
+        self.numbers[0] = 0.0
+"""
+WATCHED = """
+    import json
+    from numba.core import event
+    from adapters.systems import make_system
+    from mape.config import from_table
+    from mape.loop import Loop
+
+    compiled, hashes = event.RecordingListener(), []
+    event.register("numba:compile", compiled)
+    for engine in ("auto", "python"):
+        table = {table!r}
+        table["execute"] = {{"engine": engine}}
+        loop = Loop(chosen := from_table(table), make_system(chosen.system))
+        loop.run(9)
+        assert (loop.stretches() is not None) == (engine == "auto")
+        hashes.append(loop.log.sha256())
+    print(json.dumps([len(compiled.buffer), hashes]))
+"""
+
+
+def test_an_edited_rule_of_a_detector_is_seen_by_stretches_and_a_second_process_compiles_nothing(tmp_path):
+    text = WATCHED.format(table={**GRID, "monitor": {"detectors": ["a_watch:Watch"]}})
+
+    def run(factor):
+        (tmp_path / "a_watch.py").write_text(WATCH.replace("0.5", factor))
+        events, (compiled, plain) = json.loads(fresh_process(tmp_path, text, PYTHONDONTWRITEBYTECODE="1"))
+        assert compiled == plain
+        return events, plain
+
+    (_, first), (_, edited) = run("0.5"), run("0.25")
+    assert first != edited
+    assert run("0.25") == (0, edited)
+    assert run("0.5") == (0, first)
+
+
+@pytest.fixture
+def nowhere_else(tmp_path, monkeypatch):
+    """Let the user's own folders be unusable, and return the one in the temporary folder."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("MAPEK_CACHE", str(tmp_path / "file" / "below"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path / f"mapek-{os.getuid()}"
+
+
+def test_where_nothing_else_can_be_written_compiled_code_is_kept_in_a_temporary_folder(nowhere_else):
+    assert cache_folder() == nowhere_else
+    assert nowhere_else.stat().st_mode & 0o777 == 0o700
+    assert cache_folder() == nowhere_else
+
+
+@pytest.mark.parametrize("planted", [lambda path: path.mkdir(mode=0o755), lambda path: path.symlink_to(path.parent)])
+def test_a_temporary_folder_in_which_others_could_put_code_is_not_used(nowhere_else, planted):
+    planted(nowhere_else)
+    with pytest.raises(ConfigError, match="name one in MAPEK_CACHE"):
+        cache_folder()

@@ -231,7 +231,7 @@ class StubbornExponential(Exponential):
 class Unrulable(QLearning):
     def __init__(self, config):
         super().__init__(config)
-        self.value = lambda q, rows, count, state, epsilon: 0.0
+        self.value = lambda q, rows, count, state, best, epsilon: 0.0
 
 
 OWN = [
