@@ -41,8 +41,8 @@ class Knowledge:
         self._remembered: OrderedDict[str, QTable] = OrderedDict()
         self._memory = memory
 
-    def serve_q_table(self, read: Callable[[], QTable]) -> None:
-        """Let Execute, the only writer of the Q-table, say how a copy of it is had."""
+    def serve_q_table(self, read: Callable[[], QTable] | None) -> None:
+        """Let Execute, the only writer of the Q-table, say how a copy of it is had; None when it leaves."""
         self._read_q = read
 
     def q_table(self) -> QTable:
@@ -51,10 +51,10 @@ class Knowledge:
         Raises
         ------
         LookupError
-            No Execute has joined yet.
+            No Execute is there.
         """
         if self._read_q is None:
-            raise LookupError("no Execute serves a Q-table yet")
+            raise LookupError("no Execute is there that serves a Q-table")
         return self._read_q()
 
     def remember(self, table: QTable) -> str:

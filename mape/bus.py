@@ -80,8 +80,10 @@ class LocalBus:
         """Do nothing: within a process all is connected."""
 
     def close(self) -> None:
-        """Drop what still waits, and take nothing more; the log keeps what it has."""
+        """Drop what still waits and all handlers, and take nothing more; the log keeps what it has."""
         self._waiting.clear()
+        for handlers in self._handlers.values():
+            handlers.clear()
         self._append = _closed
 
 

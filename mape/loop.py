@@ -220,6 +220,11 @@ class Loop:
             found.append("somebody listens to each record")
         return found
 
+    def close(self) -> None:
+        """Let the components go, which hold one another: what a loop takes is then free at once."""
+        self.bus.close()
+        self.knowledge.serve_q_table(None)
+
     def _swap_before(self, number: int) -> None:
         while self._swaps and self._swaps[0].pass_no <= number:
             self.swap()

@@ -86,7 +86,7 @@ def run_trial(
             running.run(config.episodes)
         finally:
             running.log.flush()  # what is finished is heard of, whatever happened then
-        return TrialResult(
+        result = TrialResult(
             trial,
             running.log.passes,
             steps,
@@ -96,6 +96,8 @@ def run_trial(
             loop,
             tuple(handed_over),
         )
+        running.close()
+        return result
     except MapekError as error:
         if config.units > 1 and not str(error).startswith("trial "):
             told = f"trial {trial}" if config.loops == 1 else f"trial {trial}, loop {loop}"

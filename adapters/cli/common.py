@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
+import gc
 import json
 import re
 import sys
@@ -22,7 +24,9 @@ from mape.errors import ConfigError
 
 
 def prepare() -> None:
-    """Make the adapters' parts known by name, and long compilations heard."""
+    """Make the adapters' parts known by name, long compilations heard, and the end of the process quick."""
+    # Python looks for garbage a last time, among all that Numba keeps, which takes longer than many a run.
+    atexit.register(gc.freeze)
     detectors.register()
     announce_compilation()
 

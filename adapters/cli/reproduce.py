@@ -49,7 +49,9 @@ def execute(chosen: argparse.Namespace) -> int:
         results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet)
         say(chosen)
         result = {"experiment": chosen.experiment, "profile": profile, "trials": configs[agents[0]].trials}
-        if not chosen.no_statistics:
+        if chosen.no_statistics:
+            result |= _steps(chosen, results)
+        else:
             result |= kind(chosen, folder, configs, results)
         result |= {
             "log_sha256": combined_hash(r.log_sha256 for agent in agents for r in results[agent]),
@@ -64,6 +66,13 @@ def execute(chosen: argparse.Namespace) -> int:
             figures = getattr(pictures, f"pictures_of_{chosen.experiment}")(folder)
         finish(chosen, folder, result, figures)
     return 0
+
+
+def _steps(chosen: argparse.Namespace, results: Results) -> dict[str, Any]:
+    steps = {agent: sum(r.total_steps for r in found) for agent, found in results.items()}
+    for agent, total in steps.items():
+        say(chosen, f"{agent}: {len(results[agent]):,} trials, {total:,} steps")
+    return {"agents": {agent: {"steps": total} for agent, total in steps.items()}}
 
 
 def _drifts(config: Config) -> tuple[int, ...]:

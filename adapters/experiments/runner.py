@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -234,6 +236,7 @@ def _start_worker() -> None:
     # Ctrl-C reaches the whole process group; the parent alone decides, and lets running chunks end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    atexit.register(gc.freeze)  # as in every process of ours: at its end nothing is looked through for garbage
     # A parent that is killed can end nobody: the workers would wait for it for ever.
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 

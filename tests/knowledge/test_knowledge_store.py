@@ -48,7 +48,7 @@ def test_a_table_that_was_never_remembered_is_not_recalled():
 
 def test_the_q_table_is_read_through_its_writer():
     knowledge = store()
-    with pytest.raises(LookupError, match="no Execute serves"):
+    with pytest.raises(LookupError, match="no Execute is there"):
         knowledge.q_table()
     knowledge.serve_q_table(lambda: table(2.0))
     assert knowledge.q_table().values[0, 0] == 2.0
