@@ -243,7 +243,7 @@ class Gridworld(RulesEnvironment[int]):
         """Tabulate where each action leads, shape (actions, states)."""
         rows, columns = self.size
         walls = set(self.walls)
-        moves = np.empty((n_actions, rows * columns), np.int64)
+        moves = np.empty((n_actions, rows * columns), np.int64, order="F")  # an episode looks at all of one state
         for action in range(n_actions):
             down, right = DIRECTIONS[action % 4]
             length = 1 + action // 4
