@@ -148,7 +148,7 @@ def _heatmaps(folder: RunFolder, agents: tuple[str, ...]) -> Figure:
         phase = rules.phase(rules.params, config.episodes)
         panels = []
         for agent in agents:
-            values, actions = folder.q_tables(agent)[0]
+            values, actions = folder.q_table(agent, 0)
             panels.append(Panel(f"trial 0: {_name(agent)}", values, actions, phase % len(base.goals)))
         rows, columns = base.size
         return q_heatmaps(panels, rows=rows, columns=columns, walls=base.walls, goals=base.goals, start=base.start)

@@ -7,7 +7,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -81,8 +81,8 @@ def read_json(path: Path) -> Any:
         raise ResultsError(f"{path} is damaged ({error}); delete it to have it made again") from error
 
 
-def read_npz(path: Path, way_out: str) -> dict[str, npt.NDArray[Any]]:
-    """Read all arrays of an ``.npz``.
+def read_npz(path: Path, way_out: str, names: Iterable[str] | None = None) -> dict[str, npt.NDArray[Any]]:
+    """Read arrays of an ``.npz``, all of them if no `names` are given.
 
     Raises
     ------
@@ -92,6 +92,6 @@ def read_npz(path: Path, way_out: str) -> dict[str, npt.NDArray[Any]]:
     try:
         # Opened here: `np.load` leaves a file that it cannot read open.
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            return {name: archive[name] for name in (archive.files if names is None else names)}
     except DAMAGE as error:
         raise ResultsError(f"{path} is damaged ({error}). {way_out}") from error

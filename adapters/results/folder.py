@@ -263,6 +263,12 @@ class RunFolder:
         trials = sorted(int(name[2:]) for name in arrays if name.startswith("q_"))
         return {t: (arrays[f"q_{t}"], tuple(arrays[f"actions_{t}"].tolist())) for t in trials}
 
+    def q_table(self, agent: str, unit: int) -> tuple[npt.NDArray[np.float64], tuple[int, ...]]:
+        """Return values and action ids at the end of one trial."""
+        path, names = self.path / f"q_tables-{agent}.npz", (f"q_{unit}", f"actions_{unit}")
+        values, actions = read_npz(path, "Run the same command again.", names).values()
+        return values, tuple(actions.tolist())
+
     def trace(self, agent: str) -> npt.NDArray[np.void] | None:
         """Return the traced steps of trial 0, or None where nothing was traced."""
         path = self.path / f"trace-{agent}.npy"
