@@ -86,6 +86,7 @@ class Log:
         self._row_size = layout.struct.size
         self._buffer = bytearray(layout.struct.size * SEGMENT)
         self._filled = 0  # bytes of the buffer in use
+        self._gone = 0  # bytes that have left it
         self._flushed_row = b""  # the newest row that has left the buffer; plan 0's before there was one
         self._hash = hashlib.sha256(layout.schema)
         self._listeners: list[_Listener] = []
@@ -96,7 +97,7 @@ class Log:
         It gets a structured array that is valid during the call. What it raises comes out of the `append` that begins
         the next pass, or of `flush`; then the record was not taken, and the segment is offered again.
         """
-        self._listeners.append(_Listener(listener, self._filled))
+        self._listeners.append(_Listener(listener, self._gone + self._filled))
 
     def append(self, record: Record) -> Ack:
         """Take `record` if it is the next one; see the class for the answers.
@@ -329,6 +330,8 @@ class Log:
         for record in open_records:
             self._take(record)
         self.flush()
+        for listener in listeners:
+            listener.told = self._gone
         self._listeners = listeners
 
     def _take(self, record: Record) -> None:
@@ -346,17 +349,18 @@ class Log:
 
     def _flush(self) -> None:
         rows = memoryview(self._buffer)[: self._filled]
+        end = self._gone + self._filled
         for listener in self._listeners:
-            if listener.told < self._filled:
-                segment = np.frombuffer(rows[listener.told :], self.layout.dtype)
+            if listener.told < end:
+                segment = np.frombuffer(rows[listener.told - self._gone :], self.layout.dtype)
                 segment.flags.writeable = False
                 listener.hear(segment)
-                listener.told = self._filled
-        self._hash.update(rows)
-        self._flushed_row = bytes(rows[-self._row_size :])
-        self._filled = 0
-        for listener in self._listeners:
-            listener.told = 0
+                listener.told = end
+        digest = self._hash.copy()
+        digest.update(rows)
+        newest = bytes(rows[-self._row_size :])
+        # At once, with no call between them: after a Ctrl-C the rows are all hashed, or all in the buffer.
+        self._hash, self._flushed_row, self._gone, self._filled = digest, newest, end, 0
 
 
 class _Unread(Sequence[Pass]):
@@ -373,7 +377,7 @@ class _Unread(Sequence[Pass]):
 
 
 class _Listener:
-    # How much of the buffer a listener was told: if another one fails, nothing is told twice.
+    # How many bytes of rows, of all so far, a listener was told: if another one fails, nothing is told twice.
     def __init__(self, hear: Callable[[npt.NDArray[np.void]], object], told: int) -> None:
         self.hear = hear
         self.told = told

@@ -8,8 +8,8 @@ imports the rules by name, holds the template's source, and is compiled with ``c
 - a second process compiles nothing: the rules are module-level globals, not closures or arguments, which Numba could
   not cache;
 - no stale code is run: Numba's cache looks only at the file of the function itself, so the folder's name holds a hash
-  of the source of every module from which a rule comes, of the global values that rules use (Numba freezes them), and
-  of the versions of all that compiles.
+  of the source of every module from which a rule comes, of the values that rules find beside their arguments (Numba
+  freezes them), and of the versions of all that compiles.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import functools
 import hashlib
 import importlib.util
 import inspect
-import itertools
 import os
 import platform
 import re
@@ -113,7 +112,8 @@ class Composed:
                 continue
             seen.add(id(item))
             yield item
-            pending += [item.__globals__[used] for used in _names(item.__code__) if used in item.__globals__]
+            # Of a module's functions only those that their author compiled can be called by way of the module.
+            pending += [value for name, value in _found(item) if "." not in name or hasattr(value, "py_func")]
 
     def compiled(self) -> Any:
         """Return the bound function as a Numba dispatcher, from the cache where it can be.
@@ -138,29 +138,57 @@ class Composed:
 def _versions() -> str:
     import llvmlite
     import numba
-    import numpy
 
-    parts = (sys.version, numba.__version__, llvmlite.__version__, numpy.__version__, platform.machine())
+    parts = (sys.version, numba.__version__, llvmlite.__version__, np.__version__, platform.machine())
     return "\n".join(parts)
 
 
 def _fingerprint(text: str, rules: tuple[Rule, ...]) -> str:
     digest = hashlib.sha256(f"{_versions()}\n{text}".encode())
-    modules = {rule.__module__ for rule in rules}
+    modules: set[str] = set()
     for rule in rules:
         plain: Any = rule
-        for used in sorted(_names(plain.__code__)):
-            value = plain.__globals__.get(used)
+        modules |= {plain.__module__, plain.__globals__["__name__"]}  # two, if the rule is what a decorator returned
+        for name, value in _found(plain):
             if isinstance(value, ModuleType):
                 modules.add(value.__name__)
-            elif value is not None and not callable(value):
-                # Numba freezes the value of a global, wherever it was imported from.
-                frozen = value.tobytes() if hasattr(value, "tobytes") else repr(value).encode()
-                digest.update(f"{rule.__qualname__}.{used}={getattr(value, 'dtype', '')}".encode() + frozen)
+            elif isinstance(value, type):
+                modules.add(value.__module__)
+            elif not callable(value):
+                digest.update(f"{rule.__qualname__}.{name}=".encode() + _frozen(value))
     for module in sorted(modules):
-        with contextlib.suppress(OSError, TypeError):  # built-in modules have no source; their version is Python's
+        # Built-in modules have no source; their version is Python's.
+        with contextlib.suppress(KeyError, OSError, TypeError):
             digest.update(inspect.getsource(sys.modules[module]).encode())
     return digest.hexdigest()[:24]
+
+
+def _found(function: Any) -> Iterator[tuple[str, Any]]:
+    """Yield, with its name, each value that a function finds beside its arguments: wherever that was imported from.
+
+    Those are globals, what it looks up in modules, the defaults of its arguments, and what encloses it.
+    """
+    names = sorted(_names(function.__code__))
+    pending = [(name, function.__globals__[name]) for name in names if name in function.__globals__]
+    looked_into: set[str] = set()
+    while pending:
+        name, value = pending.pop()
+        yield name, value
+        if isinstance(value, ModuleType) and value.__name__ not in looked_into:
+            looked_into.add(value.__name__)
+            pending += [(f"{name}.{used}", vars(value)[used]) for used in names if used in vars(value)]
+    yield "defaults", function.__defaults__ or ()
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        yield name, cell.cell_contents
+
+
+def _frozen(value: Any) -> bytes:
+    """Return bytes that are others where the value is another; the text of a large array leaves most of it out."""
+    if isinstance(value, tuple):
+        return b"(" + b",".join(map(_frozen, value)) + b")"
+    if isinstance(value, (np.ndarray, np.generic)):
+        return f"{value.dtype}{value.shape}".encode() + value.tobytes()
+    return repr(value).encode()
 
 
 def _names(code: CodeType) -> set[str]:
@@ -278,8 +306,10 @@ def _why_not(error: Exception) -> str:
             f"{rule} cannot be compiled by Numba: it makes an array, a list or a text, and compiled rules allocate "
             "nothing. Let it work in place on the numbers that it is given."
         )
-    # Each attempt ends in a line of its own that says why; the first that is not about a call tells most.
-    reasons = [after for line, after in itertools.pairwise(lines) if line.endswith(")") and "(step: " in line]
+    # Each attempt is a line of its own, and behind the innermost one stands why it failed; the first of these reasons
+    # that is not about a call tells most.
+    attempts = [line.endswith(")") and "(step: " in line for line in lines]
+    reasons = [lines[k] for k in range(1, len(lines)) if attempts[k - 1] and not attempts[k]]
     calls = [reason for reason in reasons if not reason.startswith("No implementation of function Function(<function ")]
     why = next(iter(calls or reasons or lines), type(error).__name__)
     if why.endswith("found for signature:"):

@@ -42,7 +42,9 @@ class QuietRule(NamedTuple):
           nothing changed, which repeats the learning rate of the plan before and asks for nothing else;
         - schedule: ``(state, params, episode_return) -> epsilon``: its `advance`, and the `epsilon` after it.
 
-        `signals` are the signals of the pass in the order of the run, from the return on.
+        `signals` are the signals of the pass in the order of the run, from the return on. Of what is computed, plain
+        Python and Numba give the same bits for ``+ - * /``, `math.sqrt`, `exp`, `log` and the like; not for ``**``,
+        `math.hypot`, `gamma` and `lgamma`. Outside of a function's domain, where Python raises, Numba gives NaN.
     state : the numbers that the part carries, live: a list that its own methods work on, and that is written anew after
         a compiled stretch. The function gets it, or a float64 array of the same numbers.
     params : its fixed numbers.

@@ -144,9 +144,10 @@ def each_completed(
     pending = iter(tasks)
     try:
         while True:
+            # Taken first: else the last tasks would all queue up for the others, with nobody at work here.
+            at_hand = next(pending, None) if here else None
             while len(waiting) < in_flight and (task := next(pending, None)) is not None:
                 waiting.add(executor.submit(work, *task))
-            at_hand = next(pending, None) if here else None
             if at_hand is not None:
                 yield work(*at_hand)
             elif not waiting:

@@ -37,19 +37,20 @@ class Uniforms:
         self.width = width
         self._held = max(1, min(PASSES_AT_ONCE, DRAWS_AT_ONCE // width))  # passes whose blocks are held together
         self._bits = np.random.PCG64(np.random.SeedSequence(entropy=seed, spawn_key=key))
+        self._start = self._bits.state
         self._generator = np.random.Generator(self._bits)
         self.values = np.empty(self._held * width)
-        self._first = -self._held  # finished passes before the first block that is held
-        self._next = 0  # finished passes before the block that the generator would draw now
+        self._first = -self._held  # finished passes before the first block that is held; none is
 
     def find(self, passes: int) -> int:
         """Return where in `values` the block begins of the pass that follows `passes` finished ones."""
         turn = passes - self._first
         if not 0 <= turn < self._held:
             turn = passes % self._held
-            self._first = passes - turn
-            if self._first != self._next:
-                self._bits.advance((self._first - self._next) * self.width)  # a double takes one draw
+            # From the start each time: where the generator stands is not known after a Ctrl-C.
+            self._first = -self._held
+            self._bits.state = self._start
+            self._bits.advance((passes - turn) * self.width)  # a double takes one draw
             self._generator.random(out=self.values)
-            self._next = self._first + self._held
+            self._first = passes - turn
         return turn * self.width

@@ -6,6 +6,7 @@ import functools
 from typing import Any
 
 from mape.compose import Composed, Rule
+from mape.errors import PartError
 from mape.ports import QuietRule
 
 # Bound by `mape.compose`.
@@ -17,8 +18,23 @@ def quiet_of(part: Any) -> QuietRule | None:
 
     One that is inherited does not count: a subclass may do anything else than its base. Where it does the same in a
     quiet pass it says so, by ``quiet = Base.quiet``.
+
+    Raises
+    ------
+    PartError
+        The part raised when it was asked.
     """
-    rule = getattr(part, "quiet", None) if "quiet" in vars(type(part)) else None
+    if "quiet" not in vars(type(part)):
+        return None
+    try:
+        rule = part.quiet
+    except PartError:
+        raise  # its schedule's
+    except Exception as error:
+        raise PartError(
+            f"{type(part).__name__} raised {type(error).__name__}: {error}, when it was asked for its rule (quiet). "
+            "Mend it, or choose the engine 'python', which asks for none."
+        ) from error
     return rule if isinstance(rule, QuietRule) else None
 
 

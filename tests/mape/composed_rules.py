@@ -54,6 +54,10 @@ def asks_numpy(x):
     return np.median_of_medians(x)
 
 
+def asks_math(x):
+    return math.fmod(x, 2.0)
+
+
 def adds_a_text(x):
     return x + "1"
 

@@ -154,6 +154,81 @@ def test_a_constant_that_is_imported_and_edited_is_seen(tmp_path):
     assert fresh_process(tmp_path, RUN).split()[0].strip("[,") == "55.0"
 
 
+FOUND = """
+import numpy as np
+
+STEP, OF_MODULE, OF_DECORATOR = 1.0, 2.0, 3.0
+TABLES = (np.arange(3000.0), np.arange(6.0).reshape(2, 3))
+"""
+LOOKED_INTO = """
+import numba
+from a_constant import OF_MODULE
+from a_helper import half
+
+halved = numba.njit(half)
+"""
+DECORATOR = """
+import functools
+
+
+def plus(number):
+    def decorated(rule):
+        @functools.wraps(rule)
+        def inner(x):
+            return half(x) + number
+
+        return inner
+
+    return decorated
+
+
+from a_helper import half
+"""
+FINDING = """
+import a_module
+from a_constant import OF_DECORATOR, STEP, TABLES
+from a_decorator import plus
+
+
+@plus(OF_DECORATOR)
+def decorated(x):
+    return x
+
+
+def with_default(x, step=STEP):
+    return x + step
+
+
+def rule(x):
+    tables = TABLES[0][1500] + TABLES[1][1, 0]
+    return decorated(x) + with_default(x) + a_module.OF_MODULE + a_module.halved(x) + tables
+"""
+
+
+def test_all_that_rules_find_beside_their_arguments_is_seen_when_it_is_edited(tmp_path):
+    texts = {
+        "a_helper": HELPER, "a_constant": FOUND, "a_module": LOOKED_INTO, "a_decorator": DECORATOR, "a_rule": FINDING,
+        "a_template": TEMPLATE,
+    }  # fmt: skip
+
+    def run(edited="a_rule", old="", new=""):
+        for name, text in texts.items():
+            (tmp_path / f"{name}.py").write_text(text.replace(old, new) if name == edited else text)
+        text = fresh_process(tmp_path, RUN, MAPEK_CACHE=str(tmp_path / "cache"), PYTHONDONTWRITEBYTECODE="1")
+        return json.loads(text)[0]
+
+    first = run()
+    assert first == (1.5 + 3.0) + (3.0 + 1.0) + 2.0 + 1.5 + (1500.0 + 3.0) + 1.0
+    assert run("a_constant", "STEP, OF_MODULE, OF_DECORATOR = 1.0", "STEP, OF_MODULE, OF_DECORATOR = 9.0") == first + 8
+    assert run("a_constant", "= 1.0, 2.0", "= 1.0, 9.0") == first + 7.0
+    assert run("a_constant", "2.0, 3.0", "2.0, 9.0") == first + 6.0
+    assert run("a_constant", "(3000.0)", "(3000.0)[::-1].copy()") == first - 1.0
+    assert run("a_constant", "(2, 3)", "(3, 2)") == first - 1.0
+    assert run("a_helper", "/ 2.0", "/ 4.0") == first - 1.5
+    assert run("a_decorator", "+ number", "- number") == first - 6.0
+    assert run() == first
+
+
 def scaled_by(rule, **options):
     return Composed(scaled, {"rule": rule}, **options)
 
@@ -232,6 +307,15 @@ def test_a_rule_that_numba_does_not_compile_is_named_with_the_reason_and_the_way
 def test_the_reason_is_that_of_the_rule_which_is_called_by_the_one_that_is_named():
     with pytest.raises(ConfigError, match=r"^rule calls_another cannot be compiled.*<built-in function add>.*>>> add"):
         specialise(scaled_by(composed_rules.calls_another).compiled(), (1.0,), "it")
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_the_reason_is_told_however_deep_the_rule_is_bound(depth):
+    bound = composed_rules.asks_math
+    for _ in range(depth):
+        bound = scaled_by(bound)
+    with pytest.raises(ConfigError, match=r"^rule asks_math cannot be compiled by Numba: Unknown attribute 'fmod' of"):
+        specialise(bound.compiled(), (1.0,), "it")
 
 
 def test_a_name_that_numpy_does_not_have_is_refused_too():

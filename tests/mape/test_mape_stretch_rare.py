@@ -13,8 +13,9 @@ from stretch_runs import Run, alike
 from knowledge import actions_of
 from knowledge.rows import UP
 from managed_systems.rules import ALWAYS
-from mape.errors import ConfigError, ManagedSystemError
+from mape.errors import ConfigError, ManagedSystemError, PartError
 from mape.monitor.page_hinkley import PageHinkley
+from mape.plan.exponential import Exponential
 from mape.tables import merge
 
 RULED = {"name": "ruled", "episodes": 10_000, "system": {"id": "ruled"}}
@@ -209,6 +210,33 @@ def test_a_rule_that_is_inherited_is_not_taken_for_that_of_the_subclass(over, ob
     assert run.loop.obstacles() == [obstacle]
     with pytest.raises(ConfigError, match=rf"engine 'compiled' needs rules that can be compiled, and {obstacle}\."):
         Run(merge(RULED, over), ["compiled"], make=ruled()).run(1)
+
+
+class Misspelt(PageHinkley):
+    @property
+    def quiet(self):
+        return self._rule
+
+
+class MisspeltSchedule(Exponential):
+    @property
+    def quiet(self):
+        return self._rule
+
+
+@pytest.mark.parametrize(
+    ("name", "over"),
+    [
+        ("Misspelt", {"monitor": {"detectors": ["test_mape_stretch_rare:Misspelt"]}}),
+        ("MisspeltSchedule", {"plan": {"name": "morphin", "schedule": "test_mape_stretch_rare:MisspeltSchedule"}}),
+    ],
+)
+def test_a_part_that_raises_when_it_is_asked_for_its_rule_is_not_taken_for_one_without(name, over):
+    with pytest.raises(PartError, match=rf"^{name} raised AttributeError: '{name}' object has no attribute '_rule'"):
+        Run(merge(RULED, over), ["auto"], make=ruled()).run(1)
+    plain = Run(merge(RULED, over), ["python"], make=ruled())
+    plain.run(3)
+    assert plain.loop.log.passes == 3
 
 
 class Counted(PageHinkley):

@@ -1,0 +1,52 @@
+"""Tasks on an executor, and with who asks for their results as one more worker."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from mape.trials import each_completed
+
+PATIENCE = 30.0
+
+
+@pytest.mark.parametrize("here", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 20])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_each_task_is_worked_on_once(threads, count, here):
+    with ThreadPoolExecutor(threads) as executor:
+        found = list(each_completed(executor, pow, ((k, 2) for k in range(count)), in_flight=2 * threads, here=here))
+    assert sorted(found) == [k * k for k in range(count)]
+
+
+@pytest.mark.parametrize("others", [1, 3])
+def test_as_many_tasks_as_workers_are_worked_on_at_once_by_all_of_them(others):
+    all_at_work = threading.Barrier(others + 1, timeout=PATIENCE)
+
+    def work():
+        all_at_work.wait()
+        return threading.get_ident()
+
+    with ThreadPoolExecutor(others) as executor:
+        tasks = [() for _ in range(others + 1)]
+        found = list(each_completed(executor, work, tasks, in_flight=2 * others, here=True))
+    assert found.count(threading.get_ident()) == 1
+    assert len(set(found)) == others + 1
+
+
+def test_no_task_is_begun_after_one_has_failed_here():
+    begun, other_at_work, released = [], threading.Event(), threading.Event()
+
+    def work(k):
+        begun.append(k)
+        if threading.current_thread() is threading.main_thread():
+            assert other_at_work.wait(PATIENCE)
+            raise ValueError(f"task {k} fails")
+        other_at_work.set()
+        assert released.wait(PATIENCE)
+
+    with ThreadPoolExecutor(1) as executor:
+        with pytest.raises(ValueError, match="task 0 fails"):
+            list(each_completed(executor, work, [(k,) for k in range(9)], in_flight=2, here=True))
+        released.set()
+    assert sorted(begun) == [0, 1]
