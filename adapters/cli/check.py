@@ -47,7 +47,8 @@ def _of_config(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
     if chosen.kind not in (None, "system"):
         raise ConfigError(f"of a config the system is checked; give the name of the {chosen.kind} itself")
     config = config_of(chosen.name, chosen).system
-    return "system", f"{config.id} of {chosen.name}", _system(config)
+    played = ", from its transition table" if config.tabulated else ""
+    return "system", f"{config.id} of {chosen.name}{played}", _system(config)
 
 
 def _kind_of(name: str) -> str:

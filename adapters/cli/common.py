@@ -70,7 +70,7 @@ def open_folder(
     path = Path(chosen.out) if chosen.out else default_path(name)
     folder = RunFolder(path, kind, configs, trace, chosen.arguments)
     if folder.resumed:
-        say(chosen, f"continuing in {folder.path}: {folder.resumed} trials are finished already")
+        say(chosen, f"continuing in {folder.path}: {folder.resumed:,} trials are finished already")
     return folder
 
 

@@ -69,12 +69,16 @@ def parser() -> argparse.ArgumentParser:
         description="Reproduce an experiment of arXiv 2601.20714: table1 beside the paper's numbers, jump and traffic "
         "beside numbers found before.",
     )
-    reproduce.add_argument("experiment", choices=["table1", "jump", "traffic"])
+    reproduce.add_argument(
+        "experiment", choices=["table1", "jump", "traffic"],
+        help="goals that swap corners; jumps that become possible; a junction whose traffic shifts",
+    )  # fmt: skip
     _what_runs(reproduce)
     _where_to(reproduce)
     reproduce.add_argument(
-        "--no-statistics", action="store_true", help="run, store and hash; leave out what the paper's tables say"
-    )
+        "--no-statistics", action="store_true",
+        help="leave the tables of results out; with --no-figures too, only run, store and hash",
+    )  # fmt: skip
 
     step = commands.add_parser(
         "step", help="advance record by record on Enter", description="Step through a run, record by record."
@@ -211,7 +215,10 @@ def parser() -> argparse.ArgumentParser:
         help="short name, Gymnasium id, a part of your own, or a config, of which the system is checked",
     )  # fmt: skip
     _overlays(check, seed=False)
-    check.add_argument("--kind", choices=["detector", "analyzer", "planner", "schedule", "learner", "system"])
+    check.add_argument(
+        "--kind", choices=["detector", "analyzer", "planner", "schedule", "learner", "system"],
+        help="what it is to be (default: told by its name or its members)",
+    )  # fmt: skip
     return top
 
 
@@ -237,7 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # here, where what goes wrong can still be said
         return code
     except KeyboardInterrupt:
-        print("stopped.", file=sys.stderr)
+        print("mapek: stopped.", file=sys.stderr)
         return 130
     except BrokenPipeError:
         # The reader has gone (`mapek list | head`); Python would complain once more when it flushes at exit.

@@ -82,9 +82,12 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
     say(chosen, f"episodes: {config.episodes:,}, trials: {config.trials:,}{loops}, seed: {config.seed}")
     for swap, handed_over in zip(config.swap, results[0].handed_over, strict=True):
         say(chosen, swap_sentence(swap, handed_over))
-    say(chosen, f"steps:    {_with_sd(steps)} in total")
-    say(chosen, f"return:   {_with_sd(late)}, mean of the last {last.shape[1]} episodes")
     unit, units = ("trial", "trials") if config.loops == 1 else ("loop", "loops of all trials")
+    if config.units == 1:
+        say(chosen, f"steps:    {results[0].total_steps:,} in total")
+    else:
+        say(chosen, f"steps:    {_with_sd(steps)} per {unit}")
+    say(chosen, f"return:   {_with_sd(late)}, mean of the last {last.shape[1]} episodes")
     if config.units == 1:
         alarms = ", ".join(map(str, results[0].alarms)) or "none"
         say(chosen, f"alarms:   {alarms}" + (" (episodes)" if results[0].alarms else ""))

@@ -1,7 +1,9 @@
 """Every command, as people use it."""
 
 import io
+import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -66,6 +68,17 @@ def test_show_prints_four_sentences_per_pass_and_no_other_pass(mapek: Mapek) -> 
     assert lines[3] == "Analyze   nothing changed."
     assert lines[4].startswith("Plan      plan 2: epsilon 0.914, learning rate (0.1, 0.99, 5).")
     assert not [line for line in lines[10:] if line.startswith(("---", "Execute", "Monitor", "Analyze", "Plan "))]
+
+
+def test_the_steps_of_one_trial_are_counted_and_those_of_several_averaged(mapek: Mapek) -> None:
+    one, two = (
+        mapek("run", GOALS, "--set", "episodes=3", "--trials", trials, "--no-figures", "-q", "--json", "result.json")
+        for trials in (1, 2)
+    )
+    totals = [trial["total_steps"] for trial in json.loads(Path("result.json").read_bytes())["trials"]]
+
+    assert f"\nsteps:    {totals[0]} in total\n" in one.out
+    assert re.search(rf"\nsteps:    {sum(totals) / 2:.2f} ± \S+ per trial\n", two.out)
 
 
 def test_show_follows_an_alarm_from_the_test_to_the_plan(mapek: Mapek) -> None:

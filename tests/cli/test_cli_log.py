@@ -267,7 +267,7 @@ def test_ctrl_c_ends_following_with_130(log: Path) -> None:
             process.send_signal(signal.SIGINT)
             rest, complaint = process.communicate(timeout=60)
 
-    assert (process.returncode, rest, complaint) == (130, "", "stopped.\n")
+    assert (process.returncode, rest, complaint) == (130, "", "mapek: stopped.\n")
 
 
 def test_a_reader_that_has_seen_enough_is_no_fault(here: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from adapters.cli.main import parser
+from adapters.results import read_episodes
 from adapters.systems import make_system
 from knowledge import from_json
 from mape import load, run_trial
@@ -100,6 +101,13 @@ def test_a_toy_text_is_itself_by_default_and_its_table_with_a_profile(name):
     called, compiled = (run_trial(one, 0, make_system) for one in chosen)
     assert compiled.log_sha256 == called.log_sha256
     assert compiled.q_table_sha256 == called.q_table_sha256
+
+
+@pytest.mark.parametrize("name", ["frozen_lake", "cliff_walking", "taxi"])
+def test_a_toy_text_is_learned_with_the_seed_of_its_config(name, here):
+    _typed(f"mapek run examples/{name}.toml --profile tabulated -q --no-figures --out results/{name}", here)
+    returns = read_episodes(here / "results" / name / f"episodes-{name}.npz")["return"][0]
+    assert returns[-100:].mean() > returns[:100].mean()
 
 
 def _commands():
