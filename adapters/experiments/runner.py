@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import FrameType
 from typing import Any, Literal, NamedTuple
 
 from tqdm import tqdm
@@ -142,8 +143,8 @@ def run_agents(
             wanted = sum(config.units for config in configs.values())
             units = "trials" if all(config.loops == 1 for config in configs.values()) else "loops of trials"
             raise Stopped(
-                f"stopped. {kept} of {wanted} {units} are finished and kept in {folder.path}; "
-                f"the same command with --out {folder.path} continues."
+                f"stopped. {kept:,} of {wanted:,} {units} are finished and kept in {folder.path}; "
+                f"`mapek resume {folder.path}` continues."
             ) from None
     results = {agent: folder.finished(agent) for agent in configs}
     return {agent: [found[unit] for unit in sorted(found)] for agent, found in results.items()}
@@ -208,17 +209,34 @@ def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], worker
     # as long as what is, and holds the lock of the interpreter.
     context = multiprocessing.get_context("spawn")
     others = workers - 1
-    with _Pool(others, mp_context=context, initializer=_start_worker) as pool:
-        try:
-            for results in each_completed(pool, run_chunk, tasks, in_flight=2 * others, here=True):
-                bar.update(sum(result.passes for result in results))
-            for _ in each_completed(pool, assemble, assemblies, in_flight=others, here=True):
-                pass
-        except BrokenProcessPool:
-            raise MapekError(
-                "a worker process died (killed, or out of memory?); finished trials are kept, and the same command "
-                "with the same --out continues. Fewer --workers need less memory."
-            ) from None
+    before = signal.getsignal(signal.SIGINT)
+    interrupted = False
+    try:
+        with _Pool(others, mp_context=context, initializer=_start_worker) as pool:
+            try:
+                for results in each_completed(pool, run_chunk, tasks, in_flight=2 * others, here=True):
+                    bar.update(sum(result.passes for result in results))
+                for _ in each_completed(pool, assemble, assemblies, in_flight=others, here=True):
+                    pass
+            except BrokenProcessPool:
+                raise MapekError(
+                    "a worker process died (killed, or out of memory?); finished trials are kept, and the same command "
+                    "with the same --out continues. Fewer --workers need less memory."
+                ) from None
+            except KeyboardInterrupt:
+                # The others end what they are at. Another Ctrl-C ends them at once; as an exception it would break in
+                # on the pool's end, which then would be waited for in vain.
+                interrupted = True
+                signal.signal(signal.SIGINT, _kill_workers)
+                raise
+    finally:
+        if interrupted:
+            signal.signal(signal.SIGINT, before)
+
+
+def _kill_workers(number: int, frame: FrameType | None) -> None:
+    for worker in multiprocessing.active_children():
+        worker.kill()
 
 
 class _Pool(ProcessPoolExecutor):

@@ -80,7 +80,7 @@ class Execute:
         if engine == "compiled" and system.rules is None:
             raise ConfigError(
                 f"engine 'compiled' needs a system that offers its rules; {system.name} does not. Choose 'auto' or "
-                "'python'."
+                "'python'; one with a transition table offers them with system.tabulated = true."
             )
         self.rules = None if engine == "python" else system.rules
         reset_draws, step_draws = system.draws

@@ -1,7 +1,9 @@
 """A run that is killed, interrupted or crowded out leaves what is finished, and goes on from there."""
 
+import contextlib
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -82,20 +84,24 @@ def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
         wait_until_gone(children)
 
 
+@pytest.mark.parametrize("times", [1, 2])
 def test_ctrl_c_ends_with_130_names_the_folder_and_how_to_go_on_and_keeps_what_is_finished(
-    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], times: int
 ) -> None:
     out = tmp_path / "out"
     with running(*MANY, "--out", "out", cwd=tmp_path) as process:
         wait_for_a_chunk(process, out)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to parent and workers
-        said, complaint = process.communicate()
+        for _ in range(times):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to parent and workers
+                process.wait(0.02)
+        said, complaint = process.communicate(timeout=60)
 
     assert process.returncode == 130, complaint
     kept = len(finished_chunks(out))
     assert complaint == (
         f"mapek: stopped. {kept} of 16 trials are finished and kept in out; "
-        "the same command with --out out continues.\n"
+        "`mapek resume out` continues.\n"
     )
     assert said == ""
     assert kept >= 1
