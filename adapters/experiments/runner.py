@@ -34,6 +34,7 @@ LEAST_SECONDS = 0.1  # of a chunk of a short run: in less time its files would w
 CHUNKS_PER_WORKER = 8  # at least, in a run that is long enough: so they end nearly together, and progress is seen
 CHUNK_BYTES = 16_000_000  # of Q-tables, which a worker holds until its chunk is written
 # Rough costs, in seconds.
+START_SECONDS = 1.0  # until a worker's process has loaded what it needs
 TRIAL_SECONDS = 0.5e-3  # a trial's own: its system, its components, its table
 PASS_SECONDS = {"passes": 0.5e-6, "episodes": 8e-6, "nothing": 20e-6}  # of a pass, by what is compiled
 STEP_SECONDS = {"passes": 25e-9, "episodes": 25e-9, "nothing": 10e-6}  # of a step of the longest episode
@@ -98,7 +99,7 @@ def run_agents(
     folder
         Where results are stored as they come.
     workers
-        Processes, of which this one is the first; None for one per core.
+        Processes, of which this one is the first; None for one per core, where the work is worth their start.
     trace
         Episodes of unit 0, the first loop of trial 0, whose steps are kept.
     prepare
@@ -115,17 +116,21 @@ def run_agents(
     MapekError
         A trial failed, or the disk is full.
     """
-    workers = workers or os.cpu_count() or 1
+    most = workers or os.cpu_count() or 1
+    seconds = 0.0
     finished = {agent: folder.finished(agent) for agent in configs}
     tasks: list[Task] = []
     for agent, config in configs.items():
         checked = check(config)
         missing = [unit for unit in range(config.units) if unit not in finished[agent]]
-        for first, count in chunks(missing, chunk_size(config, checked, workers)):
+        seconds += len(missing) * trial_seconds(config, checked)
+        for first, count in chunks(missing, chunk_size(config, checked, most)):
             tasks.append((config.to_json(), first, count, folder.chunk_stem(agent, first, count), trace))
     total = sum(config.units * config.episodes for config in configs.values())
     done = sum(len(finished[agent]) * config.episodes for agent, config in configs.items())
-    workers = min(workers, len(tasks))
+    if workers is None:
+        most = min(most, 1 + int(seconds / START_SECONDS))
+    workers = min(most, len(tasks))
     with tqdm(
         total=total, initial=done, unit=" episodes", unit_scale=True, disable=True if quiet else None, leave=False,
         dynamic_ncols=True, smoothing=0.1,
@@ -156,11 +161,16 @@ def chunk_size(config: Config, checked: Checked, workers: int) -> int:
     It is about a second of work, and less where the run would else have only few chunks for each worker; its Q-tables
     fit into a worker's memory.
     """
-    costs = ((PASS_SECONDS[stage.compiled], STEP_SECONDS[stage.compiled]) for stage in checked.stages)
-    trial = TRIAL_SECONDS + config.episodes * max(one + checked.max_steps * step for one, step in costs)
+    trial = trial_seconds(config, checked)
     share = config.units * trial / (workers * CHUNKS_PER_WORKER)
     seconds = min(CHUNK_SECONDS, max(LEAST_SECONDS, share))
     return max(1, int(min(seconds / trial, CHUNK_BYTES / checked.table_bytes)))
+
+
+def trial_seconds(config: Config, checked: Checked) -> float:
+    """Return roughly how long a trial takes, or one loop of it; rather too long than too short."""
+    costs = ((PASS_SECONDS[stage.compiled], STEP_SECONDS[stage.compiled]) for stage in checked.stages)
+    return TRIAL_SECONDS + config.episodes * max(one + checked.max_steps * step for one, step in costs)
 
 
 def check(config: Config, *, in_processes: bool = False) -> Checked:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapters.experiments import pictures
+from adapters.experiments import pictures, runner
 from adapters.experiments.runner import Checked, Stage, check, chunk_size, run_agents
 from adapters.results import RunFolder
 from mape.config import from_table
@@ -85,6 +85,21 @@ def test_making_the_parts_tells_what_is_compiled_and_why_no_more() -> None:
 def test_in_processes_only_episodes_are_compiled() -> None:
     (stage,) = check(grid(), in_processes=True).stages
     assert stage.compiled == "episodes"
+
+
+@pytest.mark.parametrize(("workers", "started"), [(None, False), (2, True)])
+def test_no_process_is_started_for_work_that_ends_before_it_would_begin(
+    tmp_path, monkeypatch, workers, started
+) -> None:
+    pools = []
+    run_in_workers = runner._run_in_workers
+    monkeypatch.setattr(runner, "_run_in_workers", lambda *given: pools.append(given[2]) or run_in_workers(*given))
+    monkeypatch.setattr(runner.os, "cpu_count", lambda: 2)
+    configs = {"one": grid(), "other": grid()}
+    with RunFolder(tmp_path / "out", "compare", configs) as folder:
+        results = run_agents(configs, folder, workers=workers, quiet=True)
+    assert pools == [2] * started
+    assert [len(found) for found in results.values()] == [1, 1]
 
 
 @pytest.fixture
