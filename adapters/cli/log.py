@@ -217,12 +217,12 @@ def _opened(chosen: argparse.Namespace) -> Store:
             )
         if not chosen.follow:
             raise ResultsError(f"{folder} has no log yet; --follow waits for it")
-        time.sleep(LOOK_EVERY)
+        time.sleep(LOOK_EVERY)  # until another process has made it
 
 
 def _config(store: Store, follow: bool) -> dict[str, Any] | None:
     while (config := store.facts().get("config")) is None and follow:
-        time.sleep(LOOK_EVERY)
+        time.sleep(LOOK_EVERY)  # until another process has written it
     return config
 
 

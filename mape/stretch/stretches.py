@@ -158,17 +158,7 @@ class Stretches:
 
     def _keep(self, first: int, count: int, rate: tuple[float, ...]) -> None:
         execute, layout = self._execute, self._log.layout
-        newest = ChangePlan(
-            self._log.loop,
-            first + count - 1,
-            float(self._heads[count - 1, NEXT_EPSILON]),
-            rate,
-            (),
-            (),
-            (),
-            False,
-            None,
-        )
+        newest = _quiet_plan(self._log.loop, first + count - 1, float(self._heads[count - 1, NEXT_EPSILON]), rate)
         execute.follow(newest)
         self._plan.follow(newest)
         quiet = functools.partial(
@@ -239,6 +229,11 @@ def _bounds(rules: Sequence[QuietRule], columns: Sequence[int]) -> npt.NDArray[n
     return np.array(bounds, dtype=np.int64)
 
 
+def _quiet_plan(loop: int, number: int, epsilon: float, rate: tuple[float, ...]) -> ChangePlan:
+    """Return the plan that answers a request in which nothing changed."""
+    return ChangePlan(loop, number, epsilon, rate, (), (), (), False, None)
+
+
 def _quiet_pass(
     loop: int,
     names: tuple[str, ...],
@@ -265,7 +260,7 @@ def _quiet_pass(
         Observation(loop, number, number - 1, epsilons[0], False, steps, available, known, signals),
         Symptom(loop, number, signals, available, known, readings),
         ChangeRequest(loop, number, (), (), (), signals),
-        ChangePlan(loop, number, epsilons[1], rate, (), (), (), False, None),
+        _quiet_plan(loop, number, epsilons[1], rate),
     )
 
 

@@ -127,7 +127,7 @@ def hand_on(over, role):
 def drive(over, passes, loops):
     over.join("execute")
     while not over.everybody_is_there():
-        time.sleep(0.01)
+        time.sleep(0.01)  # before any clock runs, for a bare transport that tells nobody who has come
     times, left = [], [passes] * loops
     for loop in range(loops):
         over.send(loop, "execute")
