@@ -3,6 +3,7 @@
 import faulthandler
 import importlib
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -18,6 +19,9 @@ sys.path[:] = [entry for entry in sys.path if Path(entry) != _HERE]
 sys.path += [str(_HERE / folder) for folder in ("knowledge", "mape", "replay")]
 for _package in ("knowledge", "managed_systems", "mape"):
     importlib.import_module(_package)
+
+# Ctrl-C is heard, here and by the processes that tests start: what a shell starts in its background is deaf to it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Each folder has a conftest.py, none of which --doctest-modules can import under the others' name.
 collect_ignore_glob = ["conftest.py", "*/conftest.py"]
