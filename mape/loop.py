@@ -18,6 +18,7 @@ from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, Re
 from mape.analyze import Analyze
 from mape.bus import LocalBus
 from mape.config import Config, SwapConfig
+from mape.ctrl_c import CtrlC
 from mape.errors import ConfigError
 from mape.execute import Execute
 from mape.execute.component import SIGNALS
@@ -158,15 +159,24 @@ class Loop:
             tell(swap, handed_over)
 
     def advance(self) -> Record:
-        """Move by one record, and return it: the next that waits, or the Observation of a new episode."""
-        record = self.bus.deliver()
-        if record is None:
-            if self.execute.plan is None:
-                self.plan.start(self.log.loop)
-            else:
-                self._swap_before(self.execute.passes + 1)
-                self.execute.drive()
+        """Move by one record, and return it: the next that waits, or the Observation of a new episode.
+
+        Raises
+        ------
+        PartError, ManagedSystemError
+            What a part or the system raised.
+        KeyboardInterrupt
+            After a Ctrl-C, when the record is there; after a second one at once.
+        """
+        with CtrlC():
             record = self.bus.deliver()
+            if record is None:
+                if self.execute.plan is None:
+                    self.plan.start(self.log.loop)
+                else:
+                    self._swap_before(self.execute.passes + 1)
+                    self.execute.drive()
+                record = self.bus.deliver()
         assert record is not None
         return record
 
@@ -177,20 +187,24 @@ class Loop:
         ------
         PartError, ManagedSystemError
             What a part or the system raised; the passes before it are logged.
+        KeyboardInterrupt
+            After a Ctrl-C, between two passes, so that another `run` goes on; after a second one at once.
         """
         execute, drive, settle = self.execute, self.execute.drive, self.bus.run
-        if execute.plan is None and self.knowledge.plan is None:
-            self.plan.start(self.log.loop)
-        settle()
-        last = execute.passes + passes
-        while execute.passes < last:
-            self._swap_before(execute.passes + 1)
-            until = min(last, self._swaps[0].pass_no - 1) if self._swaps else last
-            stretches = self.stretches()
-            while execute.passes < until:
-                if stretches is None or not stretches.run(until):
-                    drive()
-                settle()
+        with CtrlC() as ctrl_c:
+            if execute.plan is None and self.knowledge.plan is None:
+                self.plan.start(self.log.loop)
+            settle()
+            last = execute.passes + passes
+            while execute.passes < last:
+                self._swap_before(execute.passes + 1)
+                until = min(last, self._swaps[0].pass_no - 1) if self._swaps else last
+                stretches = self.stretches()
+                while execute.passes < until:
+                    if stretches is None or not stretches.run(until, ctrl_c.check):
+                        ctrl_c.check()
+                        drive()
+                    settle()
 
     def stretches(self) -> Stretches | None:
         """Compile the quiet passes of this loop, and return them; None where something keeps it from that.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -83,8 +83,8 @@ class Stretches:
         same = all(now is then for now, then in zip(self._present(), self._parts, strict=True))
         return same and _forms(self._rules()) == self._forms
 
-    def run(self, until: int) -> bool:
-        """Make passes up to number `until`, as long as they are quiet.
+    def run(self, until: int, between: Callable[[], object]) -> bool:
+        """Make passes up to number `until`, as long as they are quiet; call `between` before each compiled call.
 
         Returns
         -------
@@ -99,6 +99,7 @@ class Stretches:
         if execute.q_table is not self._table:
             self._take(execute.q_table)
         while execute.passes < until:
+            between()
             room = self._log.room()  # asked first: a listener that hears of rows then may want traces
             count = execute.quiet_until(until) - execute.passes
             if count < 1:

@@ -1,12 +1,20 @@
-"""A Ctrl-C at any line of what draws uniforms, or hashes rows, changes no bit of a run that then goes on."""
+"""A Ctrl-C at any line changes no bit of a run that then goes on."""
 
 import itertools
+import signal
 import sys
+import threading
+from pathlib import Path
 
 import pytest
-from mape_runs import GRID, config, hashes, loop_of
+from hypothesis import given
+from hypothesis import strategies as st
+from mape_runs import GRID, TRAFFIC, config, hashes, loop_of
 
+import knowledge
+import mape
 from knowledge import Log
+from mape.ctrl_c import CtrlC
 from mape.execute.uniforms import Uniforms
 
 WIDTH, PASSES = 3, 2000
@@ -75,3 +83,103 @@ def test_a_ctrl_c_while_rows_are_handed_on_leaves_all_of_them_hashed_once():
         assert hashes(loop) == hashes(whole)
         assert sorted(set(heard)) == list(range(1, 41))
     assert line > 4
+
+
+# A real Ctrl-C, between whatever two lines
+
+OURS = tuple(str(Path(package.__file__).parent) for package in (mape, knowledge))
+SWAP = {"pass": 20, "part": "plan.schedule", "to": {"name": "constant"}}
+SYSTEMS = {
+    "compiled": config(GRID, episodes=40, execute={"engine": "compiled"}),
+    "called": config(GRID, episodes=40, execute={"engine": "python"}),
+    "reserve": config(TRAFFIC, episodes=40, swap=[SWAP]),
+}
+
+
+def with_ctrl_c(call, at):
+    """Call, with a Ctrl-C before line number `at` of those of the loop; return how many of them were made."""
+    made = 0
+
+    def trace(frame, event, _):
+        nonlocal made
+        if event == "line":
+            if made == at:
+                signal.raise_signal(signal.SIGINT)
+            made += 1
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(lambda frame, event, _: trace if frame.f_code.co_filename.startswith(OURS) else None)
+    try:
+        call()
+    finally:
+        sys.settrace(before)
+    return made
+
+
+def undisturbed(kind):
+    loop = loop_of(SYSTEMS[kind])
+    made = with_ctrl_c(lambda: loop.run(40), -1)
+    return made, hashes(loop)
+
+
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_after_a_ctrl_c_at_any_line_the_same_loop_goes_on(kind):
+    lines, expected = undisturbed(kind)
+
+    @given(at=st.integers(0, lines - 1))
+    def holds(at):
+        loop = loop_of(SYSTEMS[kind])
+        try:
+            with_ctrl_c(lambda: loop.run(40), at)
+        except KeyboardInterrupt:
+            assert loop.log.passes == loop.execute.passes
+        loop.run(40 - loop.execute.passes)
+        assert hashes(loop) == expected
+
+    holds()
+
+
+def test_stepping_is_stopped_between_two_records():
+    whole = loop_of(SYSTEMS["reserve"])
+    whole.run(40)
+    loop, stopped = loop_of(SYSTEMS["reserve"]), 0
+    while loop.log.passes < 40:
+        try:
+            with_ctrl_c(loop.advance, 10)
+        except KeyboardInterrupt:
+            stopped += 1
+    assert stopped > 100
+    assert hashes(loop) == hashes(whole)
+
+
+def test_a_second_ctrl_c_is_heard_at_once():
+    def twice():
+        with CtrlC():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+            pytest.fail("the second one was not heard")
+
+    with pytest.raises(KeyboardInterrupt):
+        twice()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_who_handles_the_signal_otherwise_is_left_alone():
+    heard = []
+    before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
+    try:
+        with CtrlC() as ctrl_c:
+            signal.raise_signal(signal.SIGINT)
+            ctrl_c.check()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert heard == [1]
+
+
+def test_a_loop_runs_in_a_thread_too():
+    loop = loop_of(SYSTEMS["compiled"])
+    thread = threading.Thread(target=loop.run, args=(40,))
+    thread.start()
+    thread.join()
+    assert hashes(loop) == undisturbed("compiled")[1]
