@@ -149,8 +149,10 @@ def _heatmaps(folder: RunFolder, agents: tuple[str, ...]) -> Figure:
         panels = []
         for agent in agents:
             values, actions = folder.q_table(agent, 0)
-            panels.append(Panel(f"trial 0: {_name(agent)}", values, actions, phase % len(base.goals)))
+            panels.append(Panel(_name(agent), values, actions, phase % len(base.goals)))
         rows, columns = base.size
-        return q_heatmaps(panels, rows=rows, columns=columns, walls=base.walls, goals=base.goals, start=base.start)
+        return q_heatmaps(
+            panels, rows=rows, columns=columns, walls=base.walls, goals=base.goals, start=base.start, of="trial 0"
+        )
     finally:
         system.close()

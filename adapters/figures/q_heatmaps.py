@@ -14,6 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.path import Path as MarkerPath
 from matplotlib.ticker import MaxNLocator
 
 from adapters.figures import arrays, style
@@ -57,6 +58,7 @@ def q_heatmaps(
     walls: Sequence[Sequence[int]],
     goals: Sequence[Sequence[int]],
     start: Sequence[int] | None = None,
+    of: str = "",
 ) -> Figure:
     """Draw max_a Q(s, a) and the greedy action of every state, one heatmap per agent on one scale of colour.
 
@@ -74,6 +76,8 @@ def q_heatmaps(
         Cells (row, column) that cannot be entered, and cells of the goals in the order in which they take turns.
     start
         Cell in which episodes start; None marks none.
+    of
+        What the tables are of, such as ``"trial 0"``; it stands beside the scale.
 
     Returns
     -------
@@ -104,6 +108,7 @@ def q_heatmaps(
     figure = style.new_figure(width, down * (min(side, 3.0) * rows / columns + 0.42) + 0.4)
     grid = figure.subplots(down, across, squeeze=False)
     everything: list[Axes] = list(grid.flat)
+    jumping = False
     for i, axes in enumerate(everything):
         if i >= len(panels):
             axes.set_axis_off()
@@ -111,7 +116,7 @@ def q_heatmaps(
         panel = panels[i]
         image = np.ma.masked_array(best[i], ~known[i]).reshape(rows, columns)
         _cells(axes, image, norm)
-        style.headline(axes, style.shorten(panel.title, 30 if across < PER_ROW else 22))
+        style.headline(axes, style.two_lines(panel.title, 30 if across < PER_ROW else 22))
         _mark(axes, wall_cells, goal_cells, panel.active_goal, start_cell)
         at_goal = np.zeros(rows * columns, dtype=bool)
         if goal_cells:
@@ -119,6 +124,7 @@ def q_heatmaps(
             at_goal[row * columns + column] = True
         greedy = np.where(known[i] & ~at_goal, tables[i][1][tables[i][0].argmax(axis=0)], -1)
         _arrows(axes, greedy, best[i], columns, norm)
+        jumping = jumping or bool((greedy >= 4).any())
     over = any((norm(b[k]) > 1.0).any() for b, k in zip(best, known, strict=True))
     # Inside the last panel's frame, the bar is exactly as high as the panels.
     place = everything[across - 1].inset_axes((1.04, 0.0, 0.045, 1.0))
@@ -126,9 +132,11 @@ def q_heatmaps(
     bar.ax.tick_params(labelsize=style.SMALL, labelfontfamily=style.FAMILY, width=0.6, length=2.5, color=style.MUTED)
     bar.ax.yaxis.set_major_locator(MaxNLocator(5))
     bar.outline.set_linewidth(0.4)
-    bar.set_label("maxₐ Q(s, a)", fontsize=style.NORMAL, family=style.FAMILY, color=style.INK)
+    bar.set_label(
+        "maxₐ Q(s, a)" + (f", {of}" if of else ""), fontsize=style.NORMAL, family=style.FAMILY, color=style.INK
+    )
     unseen = any((~k & ordinary).any() for k in known)
-    _legend(figure, len(panels), unseen, wall_cells, goal_cells, start_cell)
+    _legend(figure, len(panels), jumping, unseen, wall_cells, goal_cells, start_cell)
     return figure
 
 
@@ -239,7 +247,7 @@ def _arrows(axes: Axes, greedy: Ints, best: Floats, columns: int, norm: Normaliz
         states = np.flatnonzero(np.isin(greedy, kinds))
         if not len(states):
             continue
-        right = np.array(outline + tuple((x, -y) for x, y in reversed(outline[:-1])))
+        right = _whole(outline)
         shapes, shades = [], []
         for state in states.tolist():
             down, across = DIRECTIONS[int(greedy[state]) % 4]
@@ -252,15 +260,27 @@ def _arrows(axes: Axes, greedy: Ints, best: Floats, columns: int, norm: Normaliz
         )
 
 
+def _whole(outline: tuple[tuple[float, float], ...]) -> Floats:
+    """Return an arrow's outline above the axis and below it, shape (corners, 2)."""
+    return np.array(outline + tuple((x, -y) for x, y in reversed(outline[:-1])))
+
+
 def _legend(
     figure: Figure,
     panels: int,
+    jumping: bool,
     unseen: bool,
     walls: Sequence[Cell],
     goals: Sequence[Cell],
     start: Cell | None,
 ) -> None:
     entries: list[tuple[Any, str]] = []
+    if jumping:
+        for outline, name in ((_ARROW, "greedy: move"), (_JUMP, "jump")):
+            arrow: Any = MarkerPath(_whole(outline), closed=True)
+            handle = Line2D([], [], linestyle="none", marker=arrow, color=style.INK, markersize=10.0)
+            handle.set_markeredgewidth(0.0)
+            entries.append((handle, name))
     if goals:
         entries.append((Line2D([], [], linestyle="none", marker="*", color=GOAL, markersize=7.0), "active goal"))
     if len(goals) > 1:
@@ -285,5 +305,5 @@ def _legend(
     if unseen:
         entries.append((Patch(facecolor=UNKNOWN, edgecolor="none"), "never updated"))
     if entries:
-        across = len(entries) if panels > 1 else 2 if len(entries) == 4 else 3
+        across = min(len(entries), 6) if panels > 1 else 2 if len(entries) == 4 else 3
         style.legend(figure, entries, loc="outside lower center", ncols=across, handleheight=1.1, handlelength=1.3)

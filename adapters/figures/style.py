@@ -11,6 +11,7 @@ import io
 import math
 import os
 import secrets
+import textwrap
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -123,6 +124,16 @@ def shorten(name: str, length: int = 26) -> str:
     'tuned_q_l…'
     """
     return name if len(name) <= length else name[: length - 1] + "…"
+
+
+def two_lines(name: str, length: int) -> str:
+    r"""Break a name into two lines of at most `length` letters, and cut what does not fit into them.
+
+    >>> two_lines("MORPHIN, success rule", 12)
+    'MORPHIN,\nsuccess rule'
+    """
+    lines = textwrap.wrap(name, length, break_on_hyphens=False)
+    return "\n".join([*lines[:1], *([shorten(" ".join(lines[1:]), length)] if lines[1:] else [])])
 
 
 def mark_drifts(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64]) -> LineCollection:

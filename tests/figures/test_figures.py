@@ -171,6 +171,33 @@ def test_a_jump_has_two_heads_and_a_move_one():
     assert (heads("moves", 1, 0), heads("jumps", 1, 1)) == (1, 2)
 
 
+def legend_of(figure):
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_the_legend_explains_jumps_where_there_are_some():
+    values = table(8)
+    values[3, 3] = 1.0
+    walking = heatmap(Panel("a", values, tuple(range(8)), 0))
+    values[7, 4] = 1.0
+    jumping = heatmap(Panel("a", values, tuple(range(8)), 0))
+    assert [name in legend_of(figure) for figure in (walking, jumping) for name in ("greedy: move", "jump")] == [
+        False, False, True, True
+    ]  # fmt: skip
+
+
+def test_a_long_title_goes_on_in_a_second_line():
+    values = table()
+    titles = ["MORPHIN, success rule", "fixed alpha 0.1", "x" * 60, "y " * 40]
+    figure = heatmap(*[Panel(title, values, (0, 1, 2, 3), 0) for title in titles], of="trial 0")
+    shown = [axes.get_title(loc="left") for axes in figure.axes[:4]]
+    assert shown[:2] == titles[:2]
+    assert all(len(line) <= 22 for title in shown for line in title.split("\n"))
+    assert all(title.count("\n") == 1 and title.endswith("…") for title in shown[2:])
+    assert "trial 0" in figure.axes[3].child_axes[0].get_ylabel()
+
+
 def test_goals_and_states_never_updated_do_not_set_the_scale():
     first, second = table(), table()
     first[0, [0, 4, 8]] = 500.0, 10.0, 900.0
