@@ -154,7 +154,7 @@ def _need_cryptography() -> None:
         import cryptography  # noqa: F401
     except ImportError:
         raise ConfigError(
-            "keys are made by the library cryptography, which is not installed: pip install 'mapek[keys]'"
+            "keys are made by the library cryptography, which is not installed: pip install cryptography"
         ) from None
 
 

@@ -10,12 +10,12 @@ def register() -> None:
 
     >>> register()
     >>> registry.PARTS["detector"]["adwin"].summary
-    "River's ADWIN: adaptive window, both sides; needs mapek[river]"
+    "River's ADWIN: adaptive window, both sides; needs the package river"
     """
     home = "adapters.detectors.river_detector"
     registry.register(
-        "detector", "river", f"{home}:RiverDetector", "any drift detector of River by name; needs mapek[river]"
+        "detector", "river", f"{home}:RiverDetector", "any drift detector of River by name; needs the package river"
     )
     registry.register(
-        "detector", "adwin", f"{home}:Adwin", "River's ADWIN: adaptive window, both sides; needs mapek[river]"
+        "detector", "adwin", f"{home}:Adwin", "River's ADWIN: adaptive window, both sides; needs the package river"
     )

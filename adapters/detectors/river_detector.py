@@ -56,7 +56,7 @@ def river_class(name: str) -> Any:
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"River's detector {name!r} needs the package {(error.name or 'river').partition('.')[0]!r}, which is not "
-            'installed: pip install "mapek[river]"'
+            "installed: pip install river"
         ) from None
     if name not in classes:
         raise UnknownName("detector of River", name, classes)
