@@ -17,7 +17,7 @@ from knowledge.records import (
     json_schemas,
     to_json,
 )
-from knowledge.rows import RowLayout, actions_of
+from knowledge.rows import RowLayout
 from knowledge.store import Knowledge
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "Record",
     "RowLayout",
     "Symptom",
-    "actions_of",
     "from_json",
     "json_schemas",
     "to_json",

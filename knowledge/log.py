@@ -20,6 +20,9 @@ _new = tuple.__new__
 SEGMENT = 512
 """Rows that are packed before they are hashed and handed on together."""
 
+WINDOW = 256
+"""Number of finished passes that stay readable."""
+
 
 class Ack(enum.Enum):
     """What became of a record that was sent to the log."""
@@ -72,7 +75,7 @@ class Log:
     <Ack.GAP: 'gap'>
     """
 
-    def __init__(self, layout: RowLayout, loop: int = 0, window: int = 256) -> None:
+    def __init__(self, layout: RowLayout, loop: int = 0, window: int = WINDOW) -> None:
         self.layout = layout
         self.loop = loop
         self.passes = 0  # finished passes
@@ -95,7 +98,7 @@ class Log:
         """Hand each segment of rows that are finished from now on to `listener`.
 
         It gets a structured array that is valid during the call. What it raises comes out of the `append` that begins
-        the next pass, or of `flush`; then the record was not taken, and the segment is offered again.
+        the next pass, of `room`, or of `flush`; then the record was not taken, and the segment is offered again.
         """
         self._listeners.append(_Listener(listener, self._gone + self._filled))
 

@@ -303,7 +303,7 @@ def _fault(data: bytes, refused: Any) -> MalformedRecord:
 
 def _parse(data: bytes) -> Any:
     try:
-        return json.loads(data, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+        return json.loads(data, parse_constant=_refuse_constant, object_pairs_hook=unique_names)
     except (ValueError, RecursionError) as error:
         raise MalformedRecord(f"not a JSON record: {error}") from error
 
@@ -312,7 +312,14 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not JSON")
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a JSON object of its pairs: what `json.loads` takes as `object_pairs_hook`.
+
+    Raises
+    ------
+    ValueError
+        A name stands twice, of which the standard library would take the last.
+    """
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a name stands twice in one object")

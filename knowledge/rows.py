@@ -21,6 +21,9 @@ DOWN, UP, UNKNOWN = 1, 2, 3
 DIRECTIONS: dict[Direction, int] = {"down": DOWN, "up": UP, "unknown": UNKNOWN}
 """Codes of a drift's direction in a row; 0 stands for no drift."""
 
+SIDES: dict[int, Direction] = {code: direction for direction, code in DIRECTIONS.items()}
+"""The directions by their codes."""
+
 PASS, PLAN, STEPS, EPSILON, NEXT_EPSILON, SIGNALS = range(6)
 """Places in a row's head: the first three are integers; from SIGNALS on the signals, the values, the statistics."""
 
@@ -110,7 +113,8 @@ class RowLayout:
         Raises
         ------
         ValueError
-            An action id outside ``0 .. max_actions - 1``, or a record whose width is not the run's.
+            An action id outside ``0 .. max_actions - 1``, a record whose width is not the run's, or a value of another
+            type than its field's.
         """
         readings = symptom.readings
         if self.detectors == 1:  # the common case, without a transposition
@@ -148,8 +152,9 @@ class RowLayout:
                 *numbers,
                 rare,
             )
-        except struct.error as error:
-            raise self._misfit(seen, str(error)) from error
+        except (struct.error, TypeError, OverflowError) as error:
+            why = f"{error} (sets of actions are tuples of ints, drifts a tuple of Drift, rates a tuple of floats)"
+            raise self._misfit(seen, why) from error
 
     def of_heads(
         self,
@@ -221,7 +226,7 @@ class RowLayout:
             for word in _mask(actions, self._words, self.max_actions)
         ]
         return self._rare.pack(
-            *[DIRECTIONS[direction] for direction in directions],
+            *[_code(direction) for direction in directions],
             *self._drift_codes(drifts),
             reset,
             next_reset,
@@ -237,8 +242,14 @@ class RowLayout:
                 raise ValueError(f"drift of signal {signal!r}; the run's signals are {', '.join(self.signals)}")
             if codes[signal]:
                 raise ValueError(f"two drifts of signal {signal!r} in one request; say it once")
-            codes[signal] = DIRECTIONS[direction]
+            codes[signal] = _code(direction)
         return list(codes.values())
+
+
+def _code(direction: Direction) -> int:
+    if direction not in DIRECTIONS:
+        raise ValueError(f"the direction {direction!r} of a reading or drift is not one of {', '.join(DIRECTIONS)}")
+    return DIRECTIONS[direction]
 
 
 def _hash_bytes(text: str) -> bytes:
@@ -275,12 +286,3 @@ def _mask(actions: tuple[int, ...], words: int, max_actions: int) -> tuple[int, 
             )
         bits |= 1 << action
     return tuple((bits >> (64 * word)) & _WORD for word in range(words))
-
-
-def actions_of(mask: Any) -> tuple[int, ...]:
-    """Read a mask column's words back as action ids.
-
-    >>> actions_of([5])
-    (0, 2)
-    """
-    return tuple(64 * w + bit for w, word in enumerate(mask) for bit in range(64) if int(word) >> bit & 1)

@@ -9,6 +9,9 @@ from knowledge.log import Log
 from knowledge.q_table import QTable
 from knowledge.records import ChangePlan
 
+TABLES = 8
+"""Number of Q-tables that stay remembered."""
+
 
 class Knowledge:
     """The log, the plan in force, the known actions, and the Q-tables that may be read or remembered.
@@ -33,7 +36,7 @@ class Knowledge:
         Number of Q-tables that can be remembered; the one unused for longest goes first.
     """
 
-    def __init__(self, log: Log, memory: int = 8) -> None:
+    def __init__(self, log: Log, memory: int = TABLES) -> None:
         self.log = log
         self.plan: ChangePlan | None = None
         self.actions: tuple[int, ...] = ()

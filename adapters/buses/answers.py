@@ -20,7 +20,8 @@ from adapters.buses.messages import (
     Table,
 )
 from adapters.buses.presence import Presence
-from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, OF_CONFIG, ROLES, SINCE_LIMIT, STAGE_OF
+from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, OF_CONFIG, SINCE_LIMIT
+from adapters.roles import ROLES, STAGE_OF
 from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
 from knowledge import STAGES, Ack, MalformedRecord

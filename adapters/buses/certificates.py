@@ -19,7 +19,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adapters.buses.security import AUTHORITY, KNOWLEDGE, ROLES
+from adapters.buses.security import AUTHORITY, ROLES
+from adapters.roles import KNOWLEDGE
 from mape.errors import ConfigError, UnknownName
 
 if TYPE_CHECKING:

@@ -17,25 +17,16 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
+from adapters.buses.inbox import Inbox
 from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout
-from adapters.buses.questions import ANSWER_WITHIN, Questions, Refused
-from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, ROLES, SINCE_LIMIT, STAGE_OF, Wire, hand_over, host
-from knowledge import STAGES, MalformedRecord, Record, from_json, to_json
+from adapters.buses.outbox import Outbox
+from adapters.buses.questions import Questions, Refused
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Wire, hand_over, host, role_of
+from adapters.roles import STAGE_OF
+from knowledge import MalformedRecord, Record, to_json
 from mape.errors import BusError
 
 logger = logging.getLogger(__name__)
-
-SILENCE = 0.3
-"""Seconds without a publication after which Knowledge is asked whether one was missed."""
-
-RESEND_AFTER = 0.5
-"""Seconds without an acknowledgement after which a record is sent again."""
-
-REPEAT_AFTER = 0.05
-"""The same, where Knowledge says that a record before another is missing."""
-
-RESENT_AT_ONCE = 64
-"""Most records of a loop that are sent again together."""
 
 KEEP_UP_EVERY = 0.1
 """Seconds between two looks at what is outstanding."""
@@ -54,20 +45,12 @@ class Asked(NamedTuple):
     control: Control
 
 
-class _Sent(NamedTuple):
-    number: int
-    payload: bytes
-    attachment: bytes
-    at: float
-
-
 class Member(Questions):
     """One role's link to Knowledge, for all loops of the run.
 
     Nothing rests on delivery. A record is sent until Knowledge has acknowledged it, which appends it once however often
-    it comes; the acknowledgement is not waited for. What is published is taken if it bears Knowledge's seal and is the
-    next of its loop; where one was missed, where nothing comes for a while, and at the start, Knowledge is asked for
-    what the log holds from there on.
+    it comes; the acknowledgement is not waited for (`Outbox`). Of what is published each record is seen once, in order;
+    what was missed is asked for (`Inbox`).
 
     Constructing does no I/O. `connect`, then `watch`, `send`, `receive`, `close`; all on one thread.
 
@@ -103,16 +86,12 @@ class Member(Questions):
         self.refused = 0
         self.passes = 0  # for the heartbeat: what all loops together have done
         self._config, self._versions, self._layout = dict(config or {}), dict(versions or {}), layout
-        self._input = STAGES.index(INPUT[role])
         self._arrived: SimpleQueue[Any] = SimpleQueue()  # filled by Zenoh's threads, and by nobody else
         self._waiting: deque[Record | Asked] = deque()
-        self._next: dict[int, int] = {}  # loop -> pass of the next record that is waited for
-        self._sent: dict[int, deque[_Sent]] = {}
-        self._kept: dict[int, int] = {}  # loop -> number of the last record of this stage that Knowledge has
-        self._heard: dict[int, float] = {}  # when something of a loop came last, or was asked for
-        self._fetched: set[int] = set()  # loops of which an answer is awaited
+        # Neither knows this Member: who lets go of it has it freed, and closed, at once.
+        self._inbox = Inbox(wire, role, hand_over(self._arrived, "since"), self._waiting.append)
+        self._outbox = Outbox(wire, role, hand_over(self._arrived, "ack"))
         self._kept_up_at = self._beat_at = 0.0
-        self._seal = b""
         self._leave: Callable[..., object] | None = None
 
     # Coming and going.
@@ -132,12 +111,12 @@ class Member(Questions):
         with ExitStack() as opened:
             self._session = session
             opened.callback(session.close)
-            streams = self.wire.stream(ROLES[self._input])
+            streams = self.wire.stream(role_of(INPUT[self.role]))
             opened.callback(session.declare_subscriber(streams, hand_over(self._arrived, "record")).undeclare)
             opened.callback(
                 session.declare_queryable(self.wire.control(self.role), hand_over(self._arrived, "control")).undeclare
             )
-            self._on_ack, self._on_since = hand_over(self._arrived, "ack"), hand_over(self._arrived, "since")
+            self._inbox.get = self._outbox.get = session.get
             self._beats = session.declare_publisher(self.wire.beat(self.role), **ORDERED)
             join()
             # Last: who sees the token knows that all else stands.
@@ -151,7 +130,7 @@ class Member(Questions):
         """Leave; what was not acknowledged may be lost, unless `settle` was called."""
         if self._leave is not None:
             self._leave()
-        self._session = None
+        self._session = self._inbox.get = self._outbox.get = None
 
     def __enter__(self) -> Self:
         self.connect()
@@ -186,7 +165,9 @@ class Member(Questions):
                 raise BusError(f"{self.role} waited in vain for an Execute to tell what its system's signals are")
             self._say("waiting for Execute, which has the managed system")
             pause.wait(0.05)
-        self._seal = self.joined.seal.encode()
+        self._inbox.seal = self.joined.seal.encode()
+        for loop, last in enumerate(self.joined.last):
+            self._outbox.begin(loop, last[STAGE_OF[self.role]])
         self._epoch = str(self.joined.epoch).encode()
 
     def _lost(self) -> None:
@@ -209,7 +190,7 @@ class Member(Questions):
             return
         logger.warning("%s hears nothing from Knowledge, and opens another session", self.role)
         leave()
-        self._fetched.clear()
+        self._inbox.forget_questions()
         self._attach(another, lambda: None)
 
     # Sending.
@@ -235,15 +216,15 @@ class Member(Questions):
             raise BusError(
                 f"{type(record).__name__} {record.pass_no} cannot be written for the wire: {error}"
             ) from error
-        self._submit(record.loop, record.pass_no, payload, self._epoch + b"\n" + state if state else self._epoch)
+        self._outbox.put(record.loop, record.pass_no, payload, self._epoch + b"\n" + state if state else self._epoch)
 
     def drop(self, loop: int, first: int, last: int) -> None:
         """Say that episodes of a free-running loop will not be logged."""
-        self._submit(loop, last, Dropped(loop=loop, first=first, last=last).pack(), self._epoch)
+        self._outbox.put(loop, last, Dropped(loop=loop, first=first, last=last).pack(), self._epoch)
 
     def unacknowledged(self, loop: int) -> int:
         """Return how many records of a loop were sent and not acknowledged yet."""
-        return len(self._sent.get(loop, ()))
+        return self._outbox.unacknowledged(loop)
 
     def settle(self, timeout: float | None = None) -> None:
         """Wait until all that was sent is acknowledged; what comes meanwhile is kept for `receive`.
@@ -255,28 +236,12 @@ class Member(Questions):
         """
         timeout = self.patience if timeout is None else timeout
         deadline = None if timeout is None else time.monotonic() + timeout
-        while any(self._sent.values()):
-            left = SILENCE if deadline is None else min(SILENCE, deadline - time.monotonic())
+        while not self._outbox.empty:
+            left = KEEP_UP_EVERY if deadline is None else min(KEEP_UP_EVERY, deadline - time.monotonic())
             if left <= 0:
                 raise BusError(f"Knowledge on {self.wire.endpoint} did not acknowledge what {self.role} sent in time")
-            self._take_in(min(left, KEEP_UP_EVERY))
+            self._take_in(left)
             self._keep_up(time.monotonic())
-
-    def _submit(self, loop: int, number: int, payload: bytes, attachment: bytes) -> None:
-        waiting = self._sent.get(loop)
-        if waiting is None:
-            waiting = self._sent[loop] = deque()
-        waiting.append(_Sent(number, payload, attachment, time.monotonic()))
-        self._transmit(loop, payload, attachment)
-
-    def _transmit(self, loop: int, payload: bytes, attachment: bytes) -> None:
-        session = self._session
-        if session is None:
-            raise BusError(f"{self.role} is not connected; call connect()")
-        session.get(
-            self.wire.append(self.role, loop), self._on_ack, payload=payload, attachment=attachment,
-            timeout=ANSWER_WITHIN, **ORDERED,
-        )  # fmt: skip
 
     def _acknowledged(self, reply: zenoh.Reply) -> None:
         ok = reply.ok
@@ -285,23 +250,7 @@ class Member(Questions):
             return
         self._deaf_since = None
         answer = json.loads(ok.payload.to_bytes())
-        loop = int(str(ok.key_expr).split("/")[2])
-        waiting, last = self._sent.get(loop), answer["last"]
-        kept = self._kept.get(loop, self.joined.last[loop][STAGE_OF[self.role]])
-        if last < kept:
-            kind = STAGES[STAGE_OF[self.role]].__name__
-            raise Refused(
-                f"Knowledge had {kind} {kept} of loop {loop} from {self.role}, and has them up to {last} only. Was it "
-                "started anew with an older log?"
-            )
-        self._kept[loop] = last
-        while waiting and waiting[0].number <= last:
-            waiting.popleft()
-        if not waiting:
-            return
-        # One that was lost lets all behind it come too early; they are not answered by as many repetitions.
-        if time.monotonic() - waiting[0].at > (REPEAT_AFTER if answer["ack"] == "gap" else RESEND_AFTER):
-            self._send_again(loop)
+        self._outbox.acknowledged(int(str(ok.key_expr).split("/")[2]), answer["ack"], answer["last"])
 
     def _unanswered(self, reply: zenoh.Reply) -> None:
         said = reply.err.payload.to_string() if reply.err is not None else "Timeout"
@@ -309,24 +258,15 @@ class Member(Questions):
             raise Refused(f"{self.role} is refused by Knowledge: {said}")
         self._lost()
 
-    def _send_again(self, loop: int) -> None:
-        now = time.monotonic()
-        waiting = self._sent[loop]
-        for i in range(min(len(waiting), RESENT_AT_ONCE)):
-            waiting[i] = waiting[i]._replace(at=now)
-            self._transmit(loop, waiting[i].payload, waiting[i].attachment)
-
     # Receiving.
 
     def watch(self, loop: int, number: int) -> None:
         """Receive the records of `loop` from pass `number` on, those that are in the log already first."""
-        self._next[loop] = number
-        self._fetch(loop)
+        self._inbox.watch(loop, number)
 
     def unwatch(self, loop: int) -> None:
         """Receive no more of `loop`."""
-        self._next.pop(loop, None)
-        self._heard.pop(loop, None)
+        self._inbox.unwatch(loop)
 
     def receive(self, timeout: float) -> Record | Asked | None:
         """Return the next record, or question to this role; None where neither came within `timeout` seconds.
@@ -373,26 +313,9 @@ class Member(Questions):
 
     def _hear(self, sample: zenoh.Sample) -> None:
         try:
-            if len(sample.payload) > LARGEST_MESSAGE:
-                raise MalformedRecord(f"a publication of {len(sample.payload)} bytes")
-            seal = sample.attachment
-            if seal is None or seal.to_bytes() != self._seal:
-                raise MalformedRecord("a publication that does not bear Knowledge's seal")
-            record = from_json(sample.payload.to_bytes())
-            if type(record) is not STAGES[self._input]:
-                raise MalformedRecord(f"a {type(record).__name__}, which {self.role} does not take")
+            self._inbox.hear(sample)
         except MalformedRecord as error:
             self._ignore(f"{sample.key_expr}: {error}")
-            return
-        expected = self._next.get(record.loop)
-        if expected is None or record.pass_no < expected:
-            return
-        if record.pass_no > expected:
-            self._fetch(record.loop)
-            return
-        self._next[record.loop] = expected + 1
-        self._heard[record.loop] = time.monotonic()
-        self._waiting.append(record)
 
     def _ignore(self, why: str) -> None:
         self.refused += 1
@@ -413,46 +336,16 @@ class Member(Questions):
     def _keep_up(self, now: float) -> None:
         """Send again what was not acknowledged, and ask for what may have been missed."""
         self._kept_up_at = now + KEEP_UP_EVERY
-        for loop, waiting in self._sent.items():
-            if waiting and now - waiting[0].at > RESEND_AFTER:
-                self._send_again(loop)
-        for loop in self._next:
-            silent = now - self._heard.get(loop, 0.0)
-            if silent > (ANSWER_WITHIN if loop in self._fetched else SILENCE):
-                self._fetched.discard(loop)
-                self._fetch(loop)
-
-    def _fetch(self, loop: int) -> None:
-        # The answer is not waited for: a managed system that runs freely does not stand still for it.
-        if loop in self._fetched:
-            return
-        self._fetched.add(loop)
-        self._heard[loop] = time.monotonic()
-        if self._session is None:
-            raise BusError(f"{self.role} is not connected; call connect()")
-        self._session.get(
-            f"{self.wire.ask('since')}?loop={loop};from={self._input}:{self._next[loop]}", self._on_since,
-            timeout=ANSWER_WITHIN, **ORDERED,
-        )  # fmt: skip
+        self._outbox.keep_up(now)
+        self._inbox.keep_up(now)
 
     def _caught_up(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
             self._unanswered(reply)
             return  # it is asked again after a while
         self._deaf_since = None
-        lines = reply.ok.payload.to_bytes().splitlines()
-        self._fetched.discard(int(lines[0]))
-        news = False
-        for line in lines[1:]:
-            record = from_json(line)
-            expected = self._next.get(record.loop)
-            if expected is not None and record.pass_no >= expected:
-                self._next[record.loop] = record.pass_no + 1
-                self._waiting.append(record)
-                news = True
-        # An answer that was read late, after its question was asked again, asks for no more.
-        if news and len(lines) > SINCE_LIMIT and int(lines[0]) in self._next:
-            self._fetch(int(lines[0]))
+        loop, *lines = reply.ok.payload.to_bytes().splitlines()
+        self._inbox.caught_up(int(loop), lines)
 
     # Answering, and being alive.
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from knowledge import MalformedRecord, QTable
+from knowledge.records import unique_names
 
 Number = Annotated[int, Field(ge=0, lt=2**63)]
 Name = Annotated[str, Field(min_length=1, max_length=64)]
@@ -47,7 +48,7 @@ class Message(BaseModel):
         """
         line, newline, rest = data.partition(b"\n")
         try:
-            fields = json.loads(line, object_pairs_hook=_unique)
+            fields = json.loads(line, object_pairs_hook=unique_names)
         except (ValueError, RecursionError) as error:
             raise MalformedRecord(f"not a {cls.tag()} message: {error}") from error
         if not isinstance(fields, dict) or fields.pop("schema", None) != cls.tag():
@@ -222,13 +223,6 @@ class Status(Message):
     dropped: Number
     complete: bool
     pid: Number
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if len(fields) != len(pairs):
-        raise ValueError("a name stands twice in one object")
-    return fields
 
 
 MESSAGES: tuple[type[Message], ...] = (

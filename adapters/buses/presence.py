@@ -10,7 +10,8 @@ from typing import Any
 import zenoh
 
 from adapters.buses.messages import Beat, Join, RoleStatus, Status
-from adapters.buses.wire import LARGEST_MESSAGE, ROLES, STAGE_OF
+from adapters.buses.wire import LARGEST_MESSAGE
+from adapters.roles import ROLES, STAGE_OF
 from adapters.stores.ledger import Ledger
 from knowledge import MalformedRecord
 

@@ -20,22 +20,15 @@ from typing import Any, NamedTuple
 
 import zenoh
 
+from adapters.roles import KNOWLEDGE, OPERATOR
+from adapters.roles import ROLES as STAGES
 from mape.errors import ConfigError, UnknownName
-
-KNOWLEDGE = "knowledge"
-"""The role that listens."""
-
-STAGES = ("execute", "monitor", "analyze", "plan")
-"""The roles that send records."""
-
-OPERATOR = "operator"
-"""The role of a person who looks at a run, or changes a part of it."""
 
 CLIENTS = (*STAGES, OPERATOR)
 """The roles that connect to Knowledge."""
 
 ROLES = (KNOWLEDGE, *CLIENTS)
-"""All roles. The common name of a certificate is the role, and nothing else."""
+"""All who have a certificate. Its common name is the role, and nothing else."""
 
 AUTHORITY = "ca"
 """What the files of the certificate authority are called, beside those that are called as the roles."""

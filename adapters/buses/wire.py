@@ -14,8 +14,7 @@
     mape/<system>/knowledge/beat/<role>          heartbeat of the thread that does the role's work
     mape/<system>/alive/<role>/<epoch>           liveliness token, declared last
 
-A role is the component that sends a stage's records: execute (Observation), monitor (Symptom), analyze (ChangeRequest),
-plan (ChangePlan). Knowledge is the router; `operator` is a person who looks on, or replaces a part.
+The roles stand in `adapters.roles`. Knowledge is the router; `operator` is a person who looks on, or replaces a part.
 """
 
 from __future__ import annotations
@@ -33,14 +32,12 @@ from typing import Any
 import zenoh
 
 from adapters.buses import security
+from adapters.roles import ROLES
 from knowledge import STAGES, ChangePlan, ChangeRequest, Observation, Record, Symptom
 from mape.errors import BusError, ConfigError
 
 WIRE_VERSION = 1
 """Version of the keys and messages; processes of different ones refuse each other."""
-
-ROLES = ("execute", "monitor", "analyze", "plan")
-"""The roles beside Knowledge, in the order of their stages."""
 
 INPUT: dict[str, type[Record]] = {
     "execute": ChangePlan,
@@ -49,9 +46,6 @@ INPUT: dict[str, type[Record]] = {
     "plan": ChangeRequest,
 }
 """Role -> the kind of record that it waits for."""
-
-STAGE_OF: dict[str, int] = {role: stage for stage, role in enumerate(ROLES)}
-"""Role -> number of the stage whose records it sends."""
 
 ORDERED: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.DATA}
 """Put and query options. Zenoh keeps order within one priority only, and drops by default when a link is busy."""

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from adapters.buses import certificates
-from adapters.buses.security import KNOWLEDGE, ROLES
+from adapters.buses.security import ROLES
+from adapters.roles import KNOWLEDGE
 
 
 def execute(chosen: argparse.Namespace) -> int:

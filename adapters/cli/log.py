@@ -9,17 +9,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adapters.buses.wire import STAGE_OF
 from adapters.cli.sentences import sentence
 from adapters.replay.records import BATCH, log_of
 from adapters.results.folder import read_manifest
+from adapters.roles import STAGE_OF
 from adapters.stores import Store
 from adapters.stores.sqlite_store import Event, Swap
 from knowledge import Observation, from_json
 from mape.config import SwapConfig
 from mape.errors import ConfigError, ResultsError
+from mape.parts import owner
 from mape.specs import PartSpec
-from mape.swap import owner, swap_sentence
+from mape.swap import swap_sentence
 
 LOOK_EVERY = 0.15
 """Seconds between two looks at a log that is followed."""

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import atexit
-import gc
 import logging
 import os
 import sys
@@ -13,13 +11,13 @@ from pathlib import Path
 from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, open_folder, prepare
 from adapters.processes.serve import (
-    LOG_NAME,
     Terminated,
     leash,
     serve_knowledge,
     serve_role,
     terminated_by_signal,
 )
+from adapters.stores import LOG_NAME
 from mape.config import Config
 from mape.errors import ConfigError
 
@@ -29,8 +27,6 @@ def execute(chosen: argparse.Namespace) -> int:
     prepare()
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(asctime)s %(levelname)s %(message)s")
     logging.getLogger("adapters").setLevel(logging.INFO)  # ours alone: who draws the figures has much to say
-    # At its end the interpreter looks through all objects again and again; of compiled code there are many.
-    atexit.register(gc.freeze)
     if chosen.leash:
         leash()
     try:

@@ -7,10 +7,10 @@ import json
 import sys
 
 from adapters.buses.messages import Status
-from adapters.buses.wire import ROLES
 from adapters.cli.common import operator
 from adapters.cli.sentences import sentence
 from adapters.processes.supervise import ask_status
+from adapters.roles import ROLES
 from knowledge import from_json
 from mape.errors import BusError
 

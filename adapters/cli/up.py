@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import atexit
 import contextlib
-import gc
 import json
 import sys
 import tempfile
@@ -14,16 +12,17 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from adapters.buses.wire import ROLES, Wire, system_segment
+from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, finish, open_folder, prepare, say
 from adapters.cli.run import as_json, report
 from adapters.cli.sentences import sentence
 from adapters.experiments.runner import check
 from adapters.processes.export import export
-from adapters.processes.serve import LOG_NAME, Terminated, open_ledger, terminated_by_signal
-from adapters.processes.supervise import KNOWLEDGE, Supervisor, command_of
+from adapters.processes.serve import Terminated, open_ledger, terminated_by_signal
+from adapters.processes.supervise import Supervisor, command_of
 from adapters.results import RunFolder
-from adapters.stores import Swap
+from adapters.roles import KNOWLEDGE, ROLES
+from adapters.stores import LOG_NAME, Swap
 from knowledge import from_json
 from mape.config import Config
 from mape.trials import TrialResult
@@ -31,7 +30,6 @@ from mape.trials import TrialResult
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
-    atexit.register(gc.freeze)  # as in `serve`
     try:
         with terminated_by_signal():
             return _run(chosen)
@@ -133,7 +131,6 @@ class Screen:
     def __init__(self, chosen: argparse.Namespace, config: Config) -> None:
         self._quiet = chosen.quiet
         self._total = config.units * config.episodes
-        self._began = time.monotonic()
         self._seen: deque[tuple[float, int]] = deque(maxlen=20)
         self._live: Any = None
         self._said_at = time.monotonic()

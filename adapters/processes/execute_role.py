@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from adapters.buses.member import Asked, Member
 from adapters.buses.messages import State, Table
-from adapters.processes.replacing import Unit, Wanted
+from adapters.processes.replacing import Unit, Wanted, reason
 from adapters.processes.role import IDLE, Role, plain
-from knowledge import ChangePlan, Observation, QTable, Record
+from knowledge import ChangePlan, Observation, Record
 from mape.config import Config
-from mape.errors import BusError, MapekError
+from mape.errors import BusError
 from mape.execute import Execute
 from mape.execute.adoption import fitting
+from mape.execute.checkpoint import carried_by, take_up
 from mape.loop import build_execute
 
 HEARD_AT_LEAST = 0.002
@@ -21,7 +24,15 @@ HEARD_AT_LEAST = 0.002
 
 
 class ExecuteRole(Role):
-    """Execute of all loops, with their managed systems; in lockstep it waits for each plan."""
+    """Execute of all loops; in lockstep it waits for each plan.
+
+    Parameters
+    ----------
+    name, config, member
+        As `Role` takes them.
+    systems
+        Managed systems that are there already; those that other loops need are made. `run` closes all of them.
+    """
 
     first = 0
 
@@ -30,39 +41,64 @@ class ExecuteRole(Role):
         self.systems = systems
         self.free = config.execute.mode == "free"
 
+    def run(self) -> None:
+        """Join, restore, and work until all loops are done, or `stopping` is set; then close the systems.
+
+        Raises
+        ------
+        MapekError
+            A part or the system raised, or Knowledge refuses this role.
+        """
+        with self._closing():
+            super().run()
+
+    @contextmanager
+    def _closing(self) -> Iterator[None]:
+        try:
+            yield
+        finally:
+            with ExitStack() as closed:  # all of them, even if one raises
+                for system in self.systems:
+                    closed.callback(system.close)
+
     def begin(self) -> None:
         """Make each loop's component, and restore it."""
         from adapters.systems import make_system
 
         while len(self.systems) < self.member.joined.units:
             self.systems.append(make_system(self.config.system))
+            self.member.beat()
         super().begin()
 
     def make(self, unit: Unit) -> None:
-        """Give a loop its component."""
+        """Give a loop what its component reads; the component itself is made with its state, by `_restore`."""
         unit.knowledge = self._knowledge(unit)
-        trial, loop = divmod(unit.loop, self.config.loops)
-        unit.component = build_execute(
-            self.config, self.systems[unit.loop], unit.knowledge, unit.outbox.append, trial, loop
-        )
-
-    def start(self, unit: Unit) -> None:
-        """Do nothing: plan 0 begins the loop."""
-
-    def take_up(self, unit: Unit, state: State, table: QTable | None) -> None:
-        """Restore a loop's component, and note an episode that was broken off and cannot be driven again."""
-        if table is None:
-            raise BusError(f"the state of execute at pass {state.pass_no} has no Q-table")
-        unit.component.restore(state.state, table)
-        if state.final:
-            unit.done = True
-            return
-        # In lockstep that is the plan of the state's own pass; who runs freely may be further behind with its plans.
-        in_force = unit.component.plan
-        self.member.watch(unit.loop, 0 if in_force is None else in_force.pass_no + 1)
 
     def _restore(self, unit: Unit) -> None:
-        super()._restore(unit)
+        found = self.member.snapshot(unit.loop)
+        checkpoint = None
+        if found is not None:
+            state, table = found
+            if table is None:
+                raise BusError(f"the state of execute at pass {state.pass_no} has no Q-table")
+            checkpoint = state.state, table
+        assert unit.knowledge is not None
+        trial, loop = divmod(unit.loop, self.config.loops)
+        # Made with its state: one that is given it later would have reset a plant for episode 1 by then.
+        unit.component = build_execute(
+            self.config, self.systems[unit.loop], unit.knowledge, unit.outbox.append, trial, loop, checkpoint
+        )
+        if found is not None:
+            self._swap(unit, state.pass_no)  # the learner that served then
+            unit.sent, unit.done = state.pass_no, state.final
+        if not unit.done:
+            # In lockstep that of the state's own pass; who runs freely may be further behind with its plans.
+            in_force = unit.component.plan
+            self.member.watch(unit.loop, 0 if in_force is None else in_force.pass_no + 1)
+        self._note_aborted(unit)
+
+    def _note_aborted(self, unit: Unit) -> None:
+        """Note an episode that was broken off and cannot be driven again."""
         begun = self.member.joined.begun[unit.loop]
         if begun > unit.component.passes and not self.systems[unit.loop].redrivable and not unit.done:
             self.member.note(
@@ -134,19 +170,23 @@ class ExecuteRole(Role):
         self._drive_with(unit, wanted)
 
     def _drive_with(self, unit: Unit, wanted: Wanted) -> None:
-        """Drive the next episode with the new learner; if it fails, with the old one."""
+        """Drive the next episode with the new learner; if it fails, with the old one, from where the system was."""
         execute: Execute = unit.component
+        system = self.systems[unit.loop]
         number = execute.passes + 1
         self._swap(unit, number)  # what the config plans comes first, whoever drives this episode
         old, config = execute.learner, unit.config
+        carried = carried_by(system)
         try:
             handed_over = self._replace(unit, wanted.part, wanted.spec)
             self.drive(unit)
-        except MapekError as error:
+        except Exception as error:  # whatever a learner of the user's does, the old one goes on
             unit.outbox.clear()
             execute.replace(old)
             unit.config = config
-            self._refuse(wanted, str(error))
+            if carried is not None:
+                take_up(system, carried, ())
+            self._refuse(wanted, reason(error))
             self.drive(unit)
             return
         self._took(unit, wanted, number, handed_over)
@@ -173,10 +213,16 @@ class FreeExecuteRole(ExecuteRole):
     """
 
     def run(self) -> None:
-        """Join, restore, and drive at the system's rate until all loops are done, or `stopping` is set."""
+        """Join, restore, and drive at the system's rate until all loops are done, or `stopping` is set.
+
+        Raises
+        ------
+        MapekError
+            A part or the system raised, or Knowledge refuses this role.
+        """
         rate = self.config.execute.rate
         assert rate is not None
-        with self.member:
+        with self._closing(), self.member:
             self.begin()
             for unit in self.units:
                 self._catch_up(unit)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from adapters.results.chunk import write_heads
 from adapters.results.files import whole
 from adapters.results.table import BLOCK, from_rows
-from adapters.stores.ledger import Ledger, layout_from
+from adapters.stores.ledger import Ledger
 from knowledge import ChangePlan, ChangeRequest, Observation, RowLayout, Symptom, from_json
 from mape.config import Config
 from mape.errors import ResultsError
@@ -75,11 +75,10 @@ def rows_of(ledger: Ledger, unit: int) -> Iterator[npt.NDArray[np.void]]:
             yield np.frombuffer(block, layout.dtype)
         return
     buffer = bytearray(layout.struct.size)
-    blank = layout_from({**ledger.store.facts()["layout"]})
     for number in range(1, ledger.episodes + 1):
         bodies = [ledger.store.body(unit, number, stage) for stage in range(4)]
         if None in bodies:
-            yield _dropped(blank, number)
+            yield _dropped(layout, number)
             continue
         seen, symptom, request, plan = (from_json(str(body)) for body in bodies)
         assert isinstance(seen, Observation)

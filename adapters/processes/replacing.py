@@ -1,8 +1,9 @@
 """How a role's parts are replaced: those that the config plans, and those that are asked for while the loop runs.
 
 A part that is asked for is held against its contract while the loop goes on. At the next pass that has no record yet it
-takes the old one's place; where it fails there, the old one makes that pass. Knowledge keeps from which pass on it
-serves before it takes the first record of it, so that whoever does this pass again does it with the same part.
+takes the old one's place; where it fails there, or makes what Knowledge would refuse, the old one makes that pass.
+Knowledge keeps from which pass on it serves before it takes the first record of it, so that whoever does this pass
+again does it with the same part.
 """
 
 from __future__ import annotations
@@ -16,13 +17,15 @@ from typing import Any, NamedTuple
 
 from adapters.buses.member import Asked, Member
 from adapters.buses.messages import Replaced, Swapped
-from adapters.buses.wire import STAGE_OF
 from adapters.processes.remote import RemoteKnowledge
-from knowledge import MalformedRecord, Record
+from adapters.roles import STAGE_OF
+from adapters.stores.ledger import Fit, layout_from
+from knowledge import MalformedRecord, Record, from_json, to_json
 from mape.config import Config
-from mape.errors import BusError, ConfigError, MapekError
+from mape.errors import BusError, ConfigError, MapekError, PartError
+from mape.parts import owner, with_part
 from mape.specs import PartSpec
-from mape.swap import owner, replace_part, vet, with_part
+from mape.swap import replace_part, vet
 
 logger = logging.getLogger(__name__)
 
@@ -138,7 +141,7 @@ class Replacing(ABC):
         try:
             faults = vet(wanted.part, wanted.spec, self.units[0].config)
         except Exception as error:  # whatever a part of the user's does, the loop goes on
-            faults = [str(error) or type(error).__name__]
+            faults = [reason(error)]
         self._vetted.append((wanted, faults))
 
     def _let_in(self) -> None:
@@ -182,19 +185,43 @@ class Replacing(ABC):
         try:
             handed_over = self._replace(unit, wanted.part, wanted.spec)
             self._handle(unit, record)
-        except MapekError as error:
+            self._check(unit, record)
+        except Exception as error:  # whatever a part of the user's does, the old one goes on
             unit.outbox.clear()
             put_back()
             if before is not None:
                 unit.component.restore(before[0])
-            self._refuse(wanted, str(error))
+            self._refuse(wanted, reason(error))
             self._handle(unit, record)
             return
         self._took(unit, wanted, record.pass_no, handed_over)
 
+    def _check(self, unit: Unit, given: Record) -> None:
+        """Look at what a new part has made of a record as Knowledge will, for which it is too late once it is sent.
+
+        Raises
+        ------
+        PartError
+            It cannot be written, does not fit the run, or does not hand on what it was given.
+        """
+        layout = self.member.joined.layout
+        assert layout is not None
+        fit = Fit(layout_from(layout.model_dump()))
+        for made in unit.outbox:
+            try:
+                fit.check(from_json(to_json(made)))
+            except ValueError as error:
+                raise PartError(str(error)) from error
+            for name in made._fields:
+                if name in given._fields and (says := getattr(made, name)) != (was := getattr(given, name)):
+                    raise PartError(
+                        f"its {type(made).__name__} says {name} = {says}, and was given {was}; a part hands that on"
+                    )
+
     def _undo(self, unit: Unit) -> Callable[[], None]:
         """Return what puts the parts back that a component has now."""
-        component, config = unit.component, unit.config
+        component, config, knowledge = unit.component, unit.config, unit.knowledge
+        plan = None if knowledge is None else knowledge.plan
         name = _HELD[self.name]
         held = getattr(component, name)
         schedule = getattr(held, "schedule", None)
@@ -205,6 +232,8 @@ class Replacing(ABC):
             setattr(component, name, held)
             if self.name == "plan":
                 component.schedule_spec = schedule_spec
+            if knowledge is not None:
+                knowledge.plan = plan
             if schedule is not None:
                 held.schedule = schedule
 
@@ -220,6 +249,15 @@ class Replacing(ABC):
             answer = Replaced(part=wanted.part, passes=passes, handed_over=wanted.handed_over)
             self._unanswered.remove(wanted)
             self.member.answer(wanted.asked, answer.pack())
+
+
+def reason(error: Exception) -> str:
+    """Return what an error says; of one that is not the loop's own, its kind too.
+
+    >>> reason(ZeroDivisionError("no budget")), reason(MapekError("epsilon is 2"))
+    ('ZeroDivisionError: no budget', 'epsilon is 2')
+    """
+    return str(error) if isinstance(error, MapekError) else f"{type(error).__name__}: {error}"
 
 
 def spec_of(to: dict[str, Any]) -> PartSpec:

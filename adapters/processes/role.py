@@ -19,19 +19,21 @@ from adapters.buses.messages import State
 from adapters.processes.remote import RemoteKnowledge
 from adapters.processes.replacing import Due, Replacing, Unit, spec_of
 from adapters.stores.ledger import layout_from
-from knowledge import ChangePlan, QTable, Record
+from knowledge import ChangePlan, Record
 from mape.analyze import Analyze
 from mape.config import Config
 from mape.errors import PartError
 from mape.loop import build_analyze, build_monitor, build_plan
 from mape.monitor import Monitor
+from mape.parts import owner
 from mape.plan import Plan
-from mape.swap import owner
 
 logger = logging.getLogger(__name__)
 
 IDLE = 0.5
 """Seconds that a role waits for a record before it looks whether it is to end."""
+
+_REMEMBERING = "Remembering/1"
 
 _HANDLERS: dict[str, Callable[[Any, Any], None]] = {
     "monitor": Monitor.on_observation,
@@ -99,6 +101,7 @@ class Role(Replacing):
             swaps = [s for s in [*planned, *recorded.get(loop, [])] if owner(s.part) == self.name]
             unit = Unit(loop, self.config, sorted(swaps, key=lambda s: s.pass_no))
             self.units.append(unit)
+            self.member.beat()  # of many loops it takes longer than a hung role is silent
             self.make(unit)
             self._restore(unit)
 
@@ -123,9 +126,9 @@ class Role(Replacing):
             self.start(unit)
             self.member.watch(unit.loop, self.first)
             return
-        state, table = found
+        state, _ = found
         self._swap(unit, state.pass_no)  # the state is that of the parts that served then
-        self.take_up(unit, state, table)
+        self.take_up(unit, state)
         unit.sent = state.pass_no
 
     def start(self, unit: Unit) -> None:
@@ -134,10 +137,12 @@ class Role(Replacing):
             unit.component.start(unit.loop)
             self._flush(unit)
 
-    def take_up(self, unit: Unit, state: State, table: QTable | None) -> None:
+    def take_up(self, unit: Unit, state: State) -> None:
         """Restore a loop's component."""
-        unit.component.restore(state.state)
-        if unit.knowledge is not None:
+        if unit.knowledge is None:
+            unit.component.restore(state.state)
+        else:
+            unit.component.restore(_without_tables(state.state, unit.knowledge))
             (plan,) = self.member.history(unit.loop, {3: state.pass_no})[:1]
             assert isinstance(plan, ChangePlan)
             unit.knowledge.plan = plan
@@ -151,8 +156,6 @@ class Role(Replacing):
     def _take(self, unit: Unit, record: Record) -> None:
         if unit.done:
             return
-        if unit.knowledge is not None:
-            unit.knowledge.at(record.pass_no)
         self._swap(unit, record.pass_no)
         if self.may_replace(unit, record.pass_no):
             self._try(unit, record)
@@ -164,7 +167,12 @@ class Role(Replacing):
             self.member.unwatch(unit.loop)
 
     def _handle(self, unit: Unit, record: Record) -> None:
+        knowledge = unit.knowledge
+        if knowledge is not None:
+            knowledge.at(record.pass_no)
         _HANDLERS[self.name](unit.component, record)
+        if knowledge is not None and knowledge.plan is not None:
+            knowledge.adopted(knowledge.plan)
 
     def _flush(self, unit: Unit) -> None:
         while unit.outbox:
@@ -181,9 +189,10 @@ class Role(Replacing):
 
     def keep(self, unit: Unit) -> None:
         """Have a loop's state kept at Knowledge."""
-        state = self._state(unit)
-        if state is not None:
-            self.member.keep(State(loop=unit.loop, pass_no=unit.sent, state=state[0]))
+        found = self._state(unit)
+        if found is not None:
+            state = found[0] if unit.knowledge is None else _with_tables(found[0], unit.knowledge)
+            self.member.keep(State(loop=unit.loop, pass_no=unit.sent, state=state))
 
     def _state(self, unit: Unit) -> tuple[Any] | None:
         """Return the component's state, or None where its part does not give it."""
@@ -196,6 +205,21 @@ class Role(Replacing):
             unit.keeps_state = False
             logger.warning("%s keeps no state: %s", self.name, error)
             return None
+
+
+def _with_tables(state: Any, knowledge: RemoteKnowledge) -> Any:
+    """Return Plan's state with the Q-tables that can be recalled; where there are none, as it is."""
+    if not knowledge.remembered:
+        return state
+    return {"schema": _REMEMBERING, "state": state, "remembered": knowledge.remembered}
+
+
+def _without_tables(state: Any, knowledge: RemoteKnowledge) -> Any:
+    """Let `knowledge` remember the Q-tables of such a state, and return Plan's own."""
+    if not isinstance(state, dict) or state.get("schema") != _REMEMBERING:
+        return state
+    knowledge.restore(state["remembered"])
+    return state["state"]
 
 
 def plain(state: Any) -> Any:

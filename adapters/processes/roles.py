@@ -26,9 +26,13 @@ def make_role(name: str, config: Config, member_of: Callable[[Layout | None], Me
     from adapters.systems import make_system
 
     system = make_system(config.system)
-    layout = layout_of(config, system)
-    told = Layout(
-        signals=layout.signals, detectors=layout.detectors, rates=layout.rates, max_actions=layout.max_actions
-    )
-    kind = FreeExecuteRole if config.execute.mode == "free" else ExecuteRole
-    return kind(name, config, member_of(told), [system])
+    try:
+        layout = layout_of(config, system)
+        told = Layout(
+            signals=layout.signals, detectors=layout.detectors, rates=layout.rates, max_actions=layout.max_actions
+        )
+        kind = FreeExecuteRole if config.execute.mode == "free" else ExecuteRole
+        return kind(name, config, member_of(told), [system])
+    except BaseException:
+        system.close()
+        raise

@@ -25,9 +25,6 @@ from mape.errors import ResultsError
 
 logger = logging.getLogger(__name__)
 
-LOG_NAME = "log.sqlite"
-"""Name of Knowledge's file in the folder of a run."""
-
 LEFT_WITHIN = 5.0
 """Seconds that the roles of a complete run have to leave before Knowledge does."""
 
@@ -88,18 +85,20 @@ def open_ledger(config: Config, path: Path | None, durability: str) -> Ledger:
     Raises
     ------
     ResultsError
-        It is that of another run, or another process writes it.
+        It is that of another run, or not whole, or another process writes it.
     """
-    store = Store(path, durability)
-    facts = store.facts()
-    wanted = json.loads(config.to_json())
-    if facts.get("config", wanted) != wanted:
-        store.close()
-        raise ResultsError(f"{path} is the log of a run with another config; choose another folder")
-    if "config" not in facts:
-        store.set_facts(config=wanted, versions=versions())
-        store.commit()
-    return Ledger(store, config.units, config.episodes, free=config.execute.mode == "free")
+    with contextlib.ExitStack() as opened:
+        store = opened.enter_context(Store(path, durability))
+        facts = store.facts()
+        wanted = json.loads(config.to_json())
+        if facts.get("config", wanted) != wanted:
+            raise ResultsError(f"{path} is the log of a run with another config; choose another folder")
+        if "config" not in facts:
+            store.set_facts(config=wanted, versions=versions())
+            store.commit()
+        ledger = Ledger(store, config.units, config.episodes, free=config.execute.mode == "free")
+        opened.pop_all()  # the ledger's from now on
+    return ledger
 
 
 def serve_knowledge(

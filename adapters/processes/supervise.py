@@ -8,7 +8,6 @@ hung: it is killed, and started again.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import subprocess
 import sys
@@ -16,16 +15,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import zenoh
 
 from adapters.buses.messages import Status
-from adapters.buses.wire import ROLES, Wire
+from adapters.buses.wire import LEASE_MS, Wire
+from adapters.roles import KNOWLEDGE, OPERATOR, ROLES
 from knowledge import MalformedRecord
 from mape.errors import BusError, ConfigError, MapekError
-
-KNOWLEDGE = "knowledge"
 
 LOOK_EVERY = 0.1
 """Seconds between two looks at the processes."""
@@ -44,6 +42,12 @@ CRASHES = 10
 
 FRESH = 3.0
 """Seconds for which Knowledge's word on who is hung is believed."""
+
+STOPPED_AFTER = LEASE_MS / 1000
+"""Seconds from one look at the clock to the next after which this process is taken to have been stopped, as by Ctrl-Z.
+
+Meanwhile it has heard nobody, and its link to Knowledge may be gone.
+"""
 
 
 class Failed(MapekError):
@@ -152,6 +156,8 @@ class Supervisor:
         self.status: Status | None = None
         self._heard_at = 0.0
         self._asked_at = 0.0
+        self._awake_at = 0.0
+        self._listens_since = 0.0  # no silence began before
         self._passes = 0
         self._operator: zenoh.Session | None = None
 
@@ -161,8 +167,7 @@ class Supervisor:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._operator is not None:
-            self._operator.close()  # type: ignore[no-untyped-call]
+        self._leave()
         for child in self.children.values():
             child.end()
         deadline = time.monotonic() + ENDS_WITHIN
@@ -186,9 +191,9 @@ class Supervisor:
         """
         # Knowledge leaves last, and leaves only a complete run; who is killed on the way out has lost nothing.
         while not self.children[KNOWLEDGE].done:
+            self._ask()  # first: what one knows from before a stop is nothing to judge by
             for child in self.children.values():
                 self._look_at(child)
-            self._ask()
             tell(self)
             time.sleep(LOOK_EVERY)  # a child may die, or Knowledge be silent: no one event tells of both
 
@@ -228,8 +233,9 @@ class Supervisor:
         return f"exit code {code}"
 
     def _is_hung(self, child: Child) -> None:
-        now = time.monotonic()
-        silent = now - child.started_at
+        now = self._now()
+        # Nobody is heard while this process, or Knowledge, is not there to hear.
+        silent = now - max(child.started_at, self._listens_since, self.children[KNOWLEDGE].started_at)
         if child.role == KNOWLEDGE:
             spoke = self._heard_at > child.started_at
             silent = min(silent, now - self._heard_at)
@@ -249,23 +255,36 @@ class Supervisor:
             child.kill()
 
     def _ask(self) -> None:
-        now = time.monotonic()
+        now = self._now()
         if now - self._asked_at < STATUS_EVERY:
             return
         self._asked_at = now
         try:
             if self._operator is None:
-                self._operator = self.wire.join("operator", 0.2)
+                self._operator = self.wire.join(OPERATOR, 0.2)
             found = ask_status(self._operator, self.wire, 0.5)
         except BusError:
             return
         if found:
             self.status = found[0]
-            self._heard_at = time.monotonic()
+            self._heard_at = self._now()
             if self.status.passes > self._passes:
                 self._passes = self.status.passes
                 for child in self.children.values():
                     child.errors = 0
+
+    def _now(self) -> float:
+        now = time.monotonic()
+        if now - self._awake_at > STOPPED_AFTER:
+            self._listens_since = now
+            self._leave()
+        self._awake_at = now
+        return now
+
+    def _leave(self) -> None:
+        operator, self._operator = self._operator, None
+        if operator is not None:
+            operator.close()  # type: ignore[no-untyped-call]
 
 
 def ask_status(session: zenoh.Session, wire: Wire, timeout: float) -> list[Status]:
@@ -288,8 +307,3 @@ def _last_sentence(child: Child) -> str:
 def command_of(role: str, config: Path, *options: str) -> list[str]:
     """Return the command line of a process."""
     return [sys.executable, "-m", "mape", "serve", str(config), "--role", role, "--leash", *options]
-
-
-def environment() -> dict[str, Any]:
-    """Return what the processes share of this one's environment."""
-    return dict(os.environ)

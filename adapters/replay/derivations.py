@@ -31,10 +31,11 @@ from mape.execute import Execute
 from mape.execute.adoption import fitting
 from mape.loop import Loop, build_analyze, build_execute, build_monitor, build_plan
 from mape.monitor import Monitor
+from mape.parts import owner
 from mape.plan import Plan
 from mape.ports import ManagedSystem
 from mape.specs import PartSpec
-from mape.swap import Component, owner, replace_part
+from mape.swap import Component, replace_part
 
 
 class Derivation(Protocol):

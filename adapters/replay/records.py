@@ -9,15 +9,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adapters.processes.serve import LOG_NAME
 from adapters.replay.derivations import Derivation, FedByLog, WholeLoop, with_swaps
-from adapters.stores import Store
+from adapters.stores import LOG_NAME, Store
 from adapters.stores.ledger import differences, layout_from
 from adapters.systems import make_system
 from knowledge import STAGES, Ack, ChangePlan, FreeLog, Observation, Record, RowLayout, from_json, to_json
 from mape.config import Config, from_table
 from mape.errors import ConfigError, PartError, ResultsError
-from mape.swap import config_at
+from mape.parts import config_at
 
 BATCH = 512
 """Records that are held in memory at a time."""

@@ -80,14 +80,15 @@ def _differences(path: Path, scratch: Path, agent: str, config: Config) -> Itera
             firsts.append((int(at[0]), place, unit, episode + 1, column, values))
     if firsts:
         _, _, unit, episode, column, (was, is_now) = min(firsts)
-        yield f"agent {agent}, {_unit(config, unit)}, episode {episode}: {column} is {was} there, and {is_now} here"
+        where = f"agent {agent}, {config.unit_name(*divmod(unit, config.loops))}, episode {episode}"
+        yield f"{where}: {column} is {was} there, and {is_now} here"
     yield from _table_differences(path, scratch, agent, config)
 
 
 def _table_differences(path: Path, scratch: Path, agent: str, config: Config) -> Iterator[str]:
     there, here = (read_npz(folder / f"q_tables-{agent}.npz", "It cannot be compared.") for folder in (path, scratch))
     for unit in range(config.units):
-        named = f"agent {agent}, {_unit(config, unit)}"
+        named = f"agent {agent}, {config.unit_name(*divmod(unit, config.loops))}"
         actions, values = f"actions_{unit}", f"q_{unit}"
         if actions not in there or values not in there:
             yield f"{named}: its Q-table is missing there"
@@ -137,11 +138,6 @@ def _equal(there: npt.NDArray[Any], here: npt.NDArray[Any]) -> npt.NDArray[np.bo
     kind = f"u{there.dtype.itemsize}"
     same: npt.NDArray[np.bool_] = np.ascontiguousarray(there).view(kind) == np.ascontiguousarray(here).view(kind)
     return same
-
-
-def _unit(config: Config, unit: int) -> str:
-    trial, loop = divmod(unit, config.loops)
-    return f"trial {trial}" if config.loops == 1 else f"trial {trial}, loop {loop}"
 
 
 def _shape(table: npt.NDArray[Any]) -> str:

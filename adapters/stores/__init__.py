@@ -2,4 +2,7 @@
 
 from adapters.stores.sqlite_store import SCHEMA, Event, Snapshot, Store, Swap
 
-__all__ = ["SCHEMA", "Event", "Snapshot", "Store", "Swap"]
+LOG_NAME = "log.sqlite"
+"""Name of Knowledge's file in the folder of a run."""
+
+__all__ = ["LOG_NAME", "SCHEMA", "Event", "Snapshot", "Store", "Swap"]

@@ -77,7 +77,7 @@ class Ledger:
         self._noted: Counter[str] = Counter()
         self._epochs: dict[str, int] = {}
         self._logs: list[Log | FreeLog] = []
-        self._fit: _Fit | None = None
+        self._fit: Fit | None = None
         self._final: set[int] = set()
         facts = store.facts()
         if "layout" in facts:
@@ -259,7 +259,7 @@ class Ledger:
 
     def _restore(self, facts: Mapping[str, Any]) -> None:
         self.layout = layout = layout_from(facts)
-        self._fit = _Fit(layout)
+        self._fit = Fit(layout)
         try:
             self._logs = [self._restored(loop, layout) for loop in range(self.units)]
         except (ValueError, LookupError, TypeError) as error:
@@ -314,7 +314,15 @@ def differences(there: str, given: str) -> str:
     return f": {'; '.join(found)}" if found else " in the way it is written"
 
 
-class _Fit:
+class Fit:
+    """What a record has to be to stand in the rows of a run.
+
+    Parameters
+    ----------
+    layout
+        Of the run's rows.
+    """
+
     # A log packs a pass when its plan comes. By then the record that does not fit would be acknowledged, published and
     # irreplaceable, and every plan would be refused in its stead; so each is packed by itself, into a blank pass,
     # before it is appended.
@@ -332,6 +340,13 @@ class _Fit:
         )
 
     def check(self, record: Record) -> None:
+        """Look whether a record fits.
+
+        Raises
+        ------
+        ValueError
+            It does not.
+        """
         named = f"{type(record).__name__} {record.pass_no}"
         if isinstance(record, Observation) and tuple(record.signals) != self._layout.signals:
             raise ValueError(

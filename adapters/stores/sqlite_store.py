@@ -19,24 +19,18 @@ table          holds
 ``roles``      how often each role has joined: its newest epoch
 ``events``     what happened beside the records: who joined, what was refused or aborted
 =============  ==========================================================================================
-
-What `commit` has returned from survives the end of the process, however sudden; with ``durability="full"`` the end of
-the machine's power too, at the price of a disk flush per commit. Not for network file systems, which do not lock.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
-import sqlite3
 import time
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from adapters.stores.database import Database, Form
 from knowledge import QTable
-from mape.errors import ResultsError
+from knowledge.q_table import SCHEMA as TABLE_SCHEMA
 
 VERSION = 1
 APPLICATION = 0x4D50454B  # "MPEK"
@@ -104,122 +98,10 @@ class Event(NamedTuple):
     text: str
 
 
-class Store:
-    """One run's file. All writes but those of `begin`, `join` and `event` wait for `commit`.
+class Store(Database):
+    """One run's file. All that is written waits for `commit`; how it is opened stands at `Database`."""
 
-    Parameters
-    ----------
-    path
-        The file, or None to keep all in memory.
-    durability
-        ``"normal"`` or ``"full"``; see the module.
-    readonly
-        Open an existing file for reading, beside a process that writes it.
-
-    Raises
-    ------
-    ResultsError
-        The file is no store of this version, another process writes it, or it cannot be opened.
-    """
-
-    def __init__(self, path: Path | None, durability: str = "normal", *, readonly: bool = False) -> None:
-        self.path = path
-        self._lock: IO[bytes] | None = None
-        self._writing = False
-        try:
-            if readonly:
-                if path is None or not path.is_file():
-                    raise ResultsError(f"there is no log {path}; `mapek up` and `mapek serve` write one")
-                self._db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
-            else:
-                self._lock = None if path is None else _locked(path)
-                # Written by the one thread that answers all queries, opened by another.
-                self._db = sqlite3.connect(path or ":memory:", isolation_level=None, check_same_thread=False)
-            self._open(durability, readonly)
-        except sqlite3.Error as error:
-            self.close()
-            raise ResultsError(f"{path} cannot be opened as a log: {error}") from error
-        except BaseException:
-            self.close()
-            raise
-
-    def _open(self, durability: str, readonly: bool) -> None:
-        application = self._number("PRAGMA application_id")
-        version = self._number("PRAGMA user_version")
-        empty = self._number("SELECT count(*) FROM sqlite_master") == 0
-        if (empty and readonly) or (not empty and application != APPLICATION):
-            raise ResultsError(f"{self.path} is no log of a run; name the folder or file that `mapek up` wrote")
-        if not empty and version != VERSION:
-            raise ResultsError(f"{self.path} has schema version {version}; this mapek reads version {VERSION}")
-        if readonly:
-            return
-        if self.path is not None:
-            self._db.execute("PRAGMA journal_mode = WAL")
-            self._db.execute(f"PRAGMA synchronous = {durability.upper()}")
-            # Each checkpoint waits for the disk, and all that wait for an acknowledgement wait with it.
-            self._db.execute("PRAGMA wal_autocheckpoint = 4000")
-        if empty:
-            script = f"PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {VERSION};"
-            self._db.executescript(f"BEGIN; {SCHEMA} {script} COMMIT;")
-
-    def close(self) -> None:
-        """Leave the file; what was not committed is gone."""
-        if hasattr(self, "_db"):
-            if self._lock is not None:
-                # Leaves one file, without its companions; not if somebody reads it just now, or the disk is full.
-                with contextlib.suppress(sqlite3.Error):
-                    self.roll_back()
-                    self._db.execute("PRAGMA journal_mode = DELETE")
-            self._db.close()
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
-    def __enter__(self) -> Store:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    # Transactions: many appends, one commit.
-
-    def commit(self) -> None:
-        """Make everything since the last commit last.
-
-        Raises
-        ------
-        ResultsError
-            The disk is full, or the file cannot be written; nothing of it was.
-        """
-        if self._writing:
-            self._run("COMMIT")
-            self._writing = False
-
-    def roll_back(self) -> None:
-        """Forget everything since the last commit."""
-        if self._writing:
-            self._writing = False
-            if self._db.in_transaction:  # SQLite rolls back by itself where the disk is full
-                self._db.execute("ROLLBACK")
-
-    def _write(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        if not self._writing:
-            self._run("BEGIN IMMEDIATE")
-            self._writing = True
-        return self._run(statement, *values)
-
-    def _run(self, statement: str, *values: Any) -> sqlite3.Cursor:
-        try:
-            return self._db.execute(statement, values)
-        except sqlite3.Error as error:
-            raise ResultsError(
-                f"{self.path} cannot be written: {error}. What was acknowledged before is kept; make room, and go on "
-                "with `mapek resume`."
-            ) from error
-
-    def _number(self, statement: str, *values: Any) -> int:
-        found = self._db.execute(statement, values).fetchone()
-        return -1 if found is None or found[0] is None else int(found[0])
+    form = Form(APPLICATION, VERSION, SCHEMA)
 
     # Facts of the run.
 
@@ -292,7 +174,7 @@ class Store:
     # States and tables.
 
     def keep_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep a role's state, and let go those that are older than the ones before it."""
+        """Keep a role's state, and let go the one before it, and the Q-tables that nothing names any longer."""
         loop, role, number, state, table, final = snapshot
         key = None if table is None else self.keep_table(table, remembered=False)
         self._write(
@@ -339,7 +221,7 @@ class Store:
         if found is None:
             return None
         actions, states, body = json.loads(found[0]), found[1], found[2]
-        header = {"schema": "QTable/1", "actions": actions, "shape": [len(actions), states], "dtype": "<f8"}
+        header = {"schema": TABLE_SCHEMA, "actions": actions, "shape": [len(actions), states], "dtype": "<f8"}
         return QTable.from_bytes({**header, "sha256": key}, body)
 
     def keep_version(self, loop: int, number: int, table: QTable) -> None:
@@ -385,17 +267,3 @@ class Store:
         """Return the events numbered above `after`."""
         query = "SELECT number, time, role, kind, loop, pass, text FROM events WHERE number > ? ORDER BY number"
         return [Event(*row) for row in self._db.execute(query, (after,))]
-
-
-def _locked(path: Path) -> IO[bytes]:
-    """Hold the file for one writer: SQLite would let two take turns. Its own locks are of another kind."""
-    try:
-        file = open(path, "ab")  # noqa: SIM115 - held until `close`
-    except OSError as error:
-        raise ResultsError(f"{path} cannot be written: {error.strerror or error}; choose another folder") from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        raise ResultsError(f"another Knowledge writes {path}; end it first, or choose another folder") from None
-    return file

@@ -14,7 +14,8 @@ from bus_records import MAKERS, TOLD, new_ledger
 from adapters.buses import KnowledgeHub, Member
 from adapters.buses.member import Asked
 from adapters.buses.messages import Join, Status
-from adapters.buses.wire import ORDERED, ROLES, role_of
+from adapters.buses.wire import ORDERED, role_of
+from adapters.roles import ROLES
 
 HERE = Path(__file__).parent
 

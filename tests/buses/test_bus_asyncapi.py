@@ -7,8 +7,8 @@ import pytest
 from adapters.buses import Wire
 from adapters.buses.asyncapi import document
 from adapters.buses.messages import MESSAGES
-from adapters.buses.wire import ROLES
 from adapters.cli.main import main
+from adapters.roles import ROLES
 from knowledge.records import json_schemas
 
 

@@ -28,7 +28,8 @@ from adapters.buses.messages import (
     Swapped,
     Table,
 )
-from adapters.buses.wire import ORDERED, ROLES
+from adapters.buses.wire import ORDERED
+from adapters.roles import ROLES
 from knowledge import MalformedRecord, QTable, from_json, to_json
 
 pytestmark = pytest.mark.timeout(240)

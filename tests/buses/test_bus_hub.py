@@ -12,7 +12,8 @@ from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
 from adapters.buses import KnowledgeHub, Wire, answers, hub
 from adapters.buses.messages import Beat, Dropped, Happened, Joined, State, Swapped, Table
-from adapters.buses.wire import ORDERED, STAGE_OF, WIRE_VERSION
+from adapters.buses.wire import ORDERED, WIRE_VERSION
+from adapters.roles import STAGE_OF
 from knowledge import QTable, to_json
 from mape.errors import BusError
 
@@ -178,7 +179,7 @@ def test_a_state_that_comes_with_its_record_is_kept_with_it(site, raw, joined):
         (
             "plan",
             join_of("plan", versions={"wire": str(WIRE_VERSION)}, config={"seed": 1}),
-            "plan is None in plan, and {'alpha': 0.1} in Knowledge",
+            "plan is nothing in plan, and {'alpha': 0.1} in Knowledge",
         ),
     ],
 )

@@ -1,16 +1,18 @@
 """What a role may rely on: in order, each once, whatever is lost, late, repeated or forged on the way."""
 
+import gc
 import threading
 
 import pytest
 from bus_peers import Site, ask, eventually, play_part, received, serve_questions, status
 from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
-from adapters.buses import Member, answers, hub, member, questions
+from adapters.buses import Member, answers, hub, inbox, member, outbox, questions
 from adapters.buses.member import Asked
 from adapters.buses.messages import Control, State, Swapped, Table
 from adapters.buses.questions import Refused
-from adapters.buses.wire import INPUT, ORDERED, ROLES
+from adapters.buses.wire import INPUT, ORDERED
+from adapters.roles import ROLES
 from knowledge import Observation, QTable, to_json
 from mape.errors import BusError, ConfigError
 
@@ -91,7 +93,7 @@ def test_a_record_is_sent_on_without_waiting_for_the_one_before(site, all_four):
 
 @pytest.mark.parametrize("limit", [1, 2, 512])
 def test_who_joins_late_gets_all_from_where_it_asks_for_it(site, monkeypatch, limit):
-    for module in (answers, member):
+    for module in (answers, inbox):
         monkeypatch.setattr(module, "SINCE_LIMIT", limit)
     site.everybody()
     site.send(*run_of(5))
@@ -151,8 +153,8 @@ def test_what_is_published_more_than_once_or_garbled_is_delivered_once_as_the_lo
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(member, "RESEND_AFTER", 0.02)
-    monkeypatch.setattr(member, "REPEAT_AFTER", 0.01)
+    monkeypatch.setattr(outbox, "RESEND_AFTER", 0.02)
+    monkeypatch.setattr(outbox, "REPEAT_AFTER", 0.01)
     monkeypatch.setattr(member, "KEEP_UP_EVERY", 0.01)
 
 
@@ -650,8 +652,9 @@ def test_dropped_episodes_are_said_and_a_reader_goes_past_them(wire, impatient, 
 
 
 def test_one_whose_link_stands_and_is_dead_opens_another_session(site, all_four, monkeypatch):
-    for name in ("ANSWER_WITHIN", "DEAF_AFTER"):
-        monkeypatch.setattr(member, name, 0.1)
+    for module in (inbox, outbox):
+        monkeypatch.setattr(module, "ANSWER_WITHIN", 0.1)
+    monkeypatch.setattr(member, "DEAF_AFTER", 0.1)
     raw, planner, heard = site.session(), all_four["plan"], threading.Event()
     site.send(plan(0))
     planner.watch(0, 1)
@@ -673,7 +676,7 @@ def test_one_whose_link_stands_and_is_dead_opens_another_session(site, all_four,
 
 
 def test_one_that_waits_for_a_busy_knowledge_keeps_its_session(site, all_four, monkeypatch):
-    for module in (member, questions):
+    for module in (inbox, outbox, questions):
         monkeypatch.setattr(module, "ANSWER_WITHIN", 0.1)
     held, true_take = threading.Event(), site.ledger.take
     monkeypatch.setattr(site.ledger, "take", lambda *given: (held.wait(10), true_take(*given))[1])
@@ -685,6 +688,23 @@ def test_one_that_waits_for_a_busy_knowledge_keeps_its_session(site, all_four, m
     held.set()
     planner.settle(10)
     assert planner._session is first
+
+
+def test_one_that_nobody_holds_any_more_leaves_at_once(wire):
+    """Not at some later moment, on whatever thread then looks for garbage."""
+    with Site(wire) as site:
+        raw = site.session()
+        held = [Member(wire, "execute", layout=TOLD, patience=10)]
+        gc.disable()
+        try:
+            held[0].connect()
+            held[0].send(observation(1))
+            held[0].watch(0, 0)
+            eventually(lambda: status(raw, wire).roles["execute"].alive)
+            held.clear()
+            eventually(lambda: not status(raw, wire).roles["execute"].alive)
+        finally:
+            gc.enable()
 
 
 # A socket of the net.

@@ -96,8 +96,10 @@ def test_a_socket_left_behind_by_a_killed_knowledge_is_taken_over(endpoint, wire
 
 
 READER = f"""{BEGIN}
-    from adapters.buses import member, questions
-    member.ANSWER_WITHIN = questions.ANSWER_WITHIN = member.DEAF_AFTER = 0.5
+    from adapters.buses import inbox, member, outbox, questions
+    for module in (inbox, outbox, questions):
+        module.ANSWER_WITHIN = 0.5
+    member.DEAF_AFTER = 0.5
     with Member(wire, "monitor") as reader:
         reader.watch(0, 1)
         print("up", flush=True)

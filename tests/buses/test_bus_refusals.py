@@ -5,7 +5,7 @@ from bus_peers import Site, ask, join_of
 from bus_records import TOLD, run_of
 
 from adapters.buses.messages import Happened, Joined, Layout, State, Swapped
-from adapters.buses.wire import ROLES
+from adapters.roles import ROLES
 from knowledge import QTable
 from mape.parts import owner
 

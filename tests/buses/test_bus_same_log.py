@@ -5,7 +5,7 @@ from bus_peers import eventually
 from bus_small_loop import Distributed, in_process, small_config
 
 from adapters.buses.messages import Control
-from adapters.buses.wire import ROLES
+from adapters.roles import ROLES
 from knowledge import from_json
 
 pytestmark = pytest.mark.timeout(60)

@@ -6,7 +6,7 @@ import pytest
 from bus_peers import Site
 from bus_records import run_of
 
-from adapters.buses import answers, member
+from adapters.buses import answers, inbox
 from adapters.buses.wire import INPUT
 from knowledge import STAGES, to_json
 
@@ -15,11 +15,11 @@ pytestmark = pytest.mark.timeout(60)
 
 def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):
     passes, limit = 512, 64
-    for module in (answers, member):
+    for module in (answers, inbox):
         monkeypatch.setattr(module, "SINCE_LIMIT", limit)
     # One answer takes it longer than it waits for an answer, and longer than silence lasts.
-    monkeypatch.setattr(member, "ANSWER_WITHIN", 0.05)
-    monkeypatch.setattr(member, "SILENCE", 0.02)
+    monkeypatch.setattr(inbox, "ANSWER_WITHIN", 0.05)
+    monkeypatch.setattr(inbox, "SILENCE", 0.02)
     asked, true_since = [], answers.Answers._since
 
     def since(self, query):

@@ -3,7 +3,8 @@
 import pytest
 
 from adapters.buses import Wire
-from adapters.buses.wire import INPUT, ROLES, STAGE_OF, role_of, system_segment
+from adapters.buses.wire import INPUT, role_of, system_segment
+from adapters.roles import ROLES, STAGE_OF
 from knowledge import STAGES
 from mape.errors import ConfigError
 

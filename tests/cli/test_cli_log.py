@@ -288,3 +288,8 @@ def test_memory_does_not_grow_with_the_log(here: Path) -> None:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert peak < os.stat(here / "log.sqlite").st_size / 5
+
+
+def test_to_read_a_log_no_transport_is_loaded():
+    script = "import sys, adapters.cli.log, adapters.cli.replay; print('zenoh' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout == "False\n"

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from knowledge_masks import actions_of
 from knowledge_strategies import direction, number, one_pass, plan, sha
 
-from knowledge import ChangePlan, ChangeRequest, Drift, Observation, Reading, RowLayout, Symptom, actions_of
+from knowledge import ChangePlan, ChangeRequest, Drift, Observation, Reading, RowLayout, Symptom
 from knowledge.rows import DIRECTIONS
 
 MAX = 130
@@ -156,6 +157,41 @@ def test_a_drift_of_no_signal_or_said_twice_is_refused():
         layout.pack_into(buffer, 0, seen, symptom, request._replace(drifts=(Drift("noise", "up"),)), chosen)
     with pytest.raises(ValueError, match="two drifts of signal 'return'"):
         layout.pack_into(buffer, 0, seen, symptom, request._replace(drifts=(Drift("return", "up"),) * 2), chosen)
+
+
+@pytest.mark.parametrize(
+    ("record", "field", "value"),
+    [
+        (2, "added", [1]),
+        (2, "drifts", [Drift("return", "up")]),
+        (2, "drifts", None),
+        (3, "add", (np.int64(63),)),
+        (3, "drop", None),
+        (3, "learning_rate", (0.1, None, 0.0)),
+        (3, "adopt", 12),
+        (3, "adopt", []),
+    ],
+)
+def test_a_value_of_another_type_is_refused_with_the_pass_and_what_is_legal(record, field, value):
+    layout = RowLayout(("return",), 1, 3)
+    records = list(one_pass(7))
+    records[record] = records[record]._replace(**{field: value})
+    buffer = bytearray(layout.struct.size)
+    with pytest.raises(ValueError, match=r"pass 7 does not fit .*sets of actions are tuples of ints"):
+        layout.pack_into(buffer, 0, *records)
+    assert not any(buffer)
+
+
+def test_a_direction_that_there_is_not_is_refused_with_those_that_there_are():
+    layout = RowLayout(("return",), 1, 3)
+    seen, symptom, request, chosen = one_pass(1)
+    sideways = symptom._replace(readings=(symptom.readings[0]._replace(direction="sideways"),))
+    for records in (
+        (seen, symptom, request._replace(drifts=(Drift("return", "sideways"),)), chosen),
+        (seen, sideways, request, chosen),
+    ):
+        with pytest.raises(ValueError, match="'sideways' of a reading or drift is not one of down, up, unknown"):
+            layout.pack_into(bytearray(layout.struct.size), 0, *records)
 
 
 def test_no_statistic_is_nan_in_a_row_and_a_statistic_of_zero_is_not():

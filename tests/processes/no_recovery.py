@@ -6,7 +6,7 @@ It shows that the tests under blows would notice.
 import sys
 
 import adapters.cli.up
-from adapters.buses import member
+from adapters.buses import member, outbox
 from adapters.cli.main import main
 from adapters.processes import role, supervise
 
@@ -19,18 +19,19 @@ def no_state(self, unit):
     self.member.watch(unit.loop, max(self.first, last[3] + (self.first == 1)))
 
 
-def no_catching_up(fetch):
-    def of_the_first_start_only(self, loop):
-        if self.joined.epoch == 1:
-            fetch(self, loop)
+def no_catching_up(join):
+    def of_the_first_start_only(self, deadline):
+        join(self, deadline)
+        if self.joined.epoch > 1:
+            self._inbox._fetch = lambda loop: None
 
     return of_the_first_start_only
 
 
 CUTS = {
     "state": lambda: setattr(role.Role, "_restore", no_state),
-    "catching-up": lambda: setattr(member.Member, "_fetch", no_catching_up(member.Member._fetch)),
-    "sending-again": lambda: setattr(member.Member, "_send_again", lambda self, loop: None),
+    "catching-up": lambda: setattr(member.Member, "_join", no_catching_up(member.Member._join)),
+    "sending-again": lambda: setattr(outbox.Outbox, "_send_again", lambda self, loop: None),
 }
 
 

@@ -9,7 +9,7 @@ from real_processes import last, passes, until
 
 from adapters.buses import Wire
 from adapters.buses.messages import Control, Replaced
-from adapters.buses.wire import ROLES
+from adapters.roles import ROLES
 from mape.analyze.changes import Changes
 from mape.config import from_table, merge
 

@@ -4,16 +4,23 @@ import os
 import re
 import signal
 import sys
+import threading
+import time
+from queue import SimpleQueue
+from types import SimpleNamespace
 
 import pytest
 from bus_peers import Site, join_of
 from real_processes import EXAMPLES, events, up, write_config
+from roles_on_threads import Roles, paced
 
 from adapters.buses import Wire
 from adapters.buses.messages import Beat, Joined
-from adapters.buses.wire import ORDERED, ROLES
+from adapters.buses.wire import ORDERED
 from adapters.processes import supervise
 from adapters.processes.supervise import Failed, Supervisor
+from adapters.roles import ROLES
+from mape.plan.morphin import Morphin
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -35,14 +42,15 @@ class Watched:
         self.told = []
         self.speaking = set(ROLES)
         self.joining = set(ROLES)
+        self.path = None
         self._pids, self._epochs = {}, {}
         commands = dict.fromkeys(("knowledge", *ROLES), SLEEPS)
         self.supervisor = Supervisor(self.wire, commands, folder, hang_after=hang_after, tell=self.told.append)
 
     def watch(self, enough=lambda watched: False):
         """Watch until it is enough, or the supervisor has given up."""
-        with Site(self.wire) as site, self.supervisor:
-            self.raw = site.session()
+        with Site(self.wire, self.path) as self.site, self.supervisor:
+            self.raw = self.site.session()
 
             def look(supervisor):
                 for role in ROLES:
@@ -108,6 +116,119 @@ def test_who_dies_otherwise_is_not_told_of_hanging(here, monkeypatch):
     with pytest.raises(Failed, match=r"plan died 3 times .*\(exit code -9\)"):
         watched.watch(kill)
     assert watched.told == []
+
+
+def test_roles_that_a_knowledge_started_again_has_not_heard_yet_are_not_hung(here, monkeypatch):
+    """However long ago they were started: their links come back only after it listens."""
+    monkeypatch.setattr(supervise, "STARTS_WITHIN", 0.8)
+    watched, looks = Watched(here, monkeypatch, hang_after=0.8), []
+    watched.path = here / "log.sqlite"
+
+    def start_knowledge_again(watched):
+        children = watched.supervisor.children
+        again = children["knowledge"].restarts
+        if watched.speaking and not again and time.monotonic() - children["plan"].started_at > 1.0:
+            watched.speaking.clear()
+            os.kill(children["knowledge"].pid, signal.SIGKILL)
+            watched.site.close()
+            watched.site.open()
+            watched.supervisor.status = None
+        # Since it answers again.
+        looks.extend([1] * (not watched.speaking and watched.supervisor.status is not None))
+        if len(looks) == 5:
+            watched.speaking.update(ROLES)
+        return again and watched.speaking
+
+    with pytest.raises(Enough):
+        watched.watch(start_knowledge_again)
+    assert (watched.restarts, watched.told) == ({"knowledge": 1}, [])
+
+
+class Awaited(Morphin):
+    """A planner that takes so long to make that a heartbeat of its role comes before it is there."""
+
+    heard = SimpleQueue()
+
+    def __init__(self, *options, **named):
+        super().__init__(*options, **named)
+        if threading.current_thread().name == "plan":
+            self.heard.get(timeout=5)
+
+
+def test_a_role_that_makes_the_parts_of_many_loops_gives_signs_of_life(here, monkeypatch):
+    monkeypatch.setitem(sys.modules, "awaited", sys.modules[__name__])
+    with Roles(paced(3, {"loops": 6, "plan": "awaited:Awaited"}), here) as run:
+        run.operator.declare_subscriber(run.wire.beat("plan"), Awaited.heard.put)
+        run.start_all()
+        run.until(lambda: run.ledger.complete, "the end")
+        run.hash()
+
+
+class Clock:
+    """Time as the supervisor sees it: it jumps where the supervisor was stopped, as by Ctrl-Z."""
+
+    def __init__(self, monkeypatch):
+        self.missed = 0.0
+        there = SimpleNamespace(monotonic=lambda: time.monotonic() + self.missed, sleep=time.sleep)
+        monkeypatch.setattr(supervise, "time", there)
+
+
+def test_a_supervisor_that_was_stopped_takes_nobody_for_hung(here, monkeypatch):
+    """What was said while it did not listen, it has not heard; that is nobody's silence."""
+    watched, clock = Watched(here, monkeypatch, hang_after=5.0), Clock(monkeypatch)
+    passed = []
+
+    def stop_and_go_on(watched):
+        if watched.supervisor.status is not None and not clock.missed:
+            clock.missed = 100.0
+        passed.extend([1] * bool(clock.missed))
+        return len(passed) > 50
+
+    with pytest.raises(Enough):
+        watched.watch(stop_and_go_on)
+    assert (watched.restarts, watched.told) == ({}, [])
+
+
+def test_who_does_not_answer_a_supervisor_right_after_its_stop_has_its_time_all_the_same(here, monkeypatch):
+    """The link that it had is gone, and the next one takes a moment."""
+    watched, clock = Watched(here, monkeypatch, hang_after=5.0), Clock(monkeypatch)
+    ask, unanswered = supervise.ask_status, []
+
+    def ask_status(*asked):
+        if clock.missed and len(unanswered) < 20:
+            unanswered.append(asked)
+            return []
+        return ask(*asked)
+
+    def stop_and_go_on(watched):
+        if watched.supervisor.status is not None and not clock.missed:
+            watched.supervisor.status, clock.missed = None, 100.0
+        return clock.missed and watched.supervisor.status is not None
+
+    monkeypatch.setattr(supervise, "ask_status", ask_status)
+    with pytest.raises(Enough):
+        watched.watch(stop_and_go_on)
+    assert len(unanswered) == 20
+    assert (watched.restarts, watched.told) == ({}, [])
+
+
+def test_who_joins_while_the_supervisor_is_stopped_is_not_taken_for_one_that_never_joined(here, monkeypatch):
+    watched, clock = Watched(here, monkeypatch, hang_after=5.0), Clock(monkeypatch)
+    watched.joining.remove("plan")
+    watched.speaking.remove("plan")
+    passed = []
+
+    def stop_and_go_on(watched):
+        if watched.supervisor.status is not None and not clock.missed:
+            clock.missed = 100.0
+            watched.joining.add("plan")
+            watched.speaking.add("plan")
+        passed.extend([1] * bool(clock.missed))
+        return len(passed) > 50
+
+    with pytest.raises(Enough):
+        watched.watch(stop_and_go_on)
+    assert (watched.restarts, watched.told) == ({}, [])
 
 
 OWN = """

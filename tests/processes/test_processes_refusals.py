@@ -1,11 +1,19 @@
 """Who does not belong to a run, or cannot do its part, is told so in one sentence; nobody else notices."""
 
 import json
+import sqlite3
 import sys
+from contextlib import closing
 
+import pytest
+from bus_small_loop import Distributed, small_config
 from real_processes import EXAMPLES, MAPEK, ROLES, Started, endpoint, last, say, started, until, up, write_config
 
+from adapters.buses import Wire
+from adapters.processes.serve import open_ledger
+from adapters.roles import ROLES as SENDERS
 from mape import load
+from mape.errors import ResultsError
 
 OLD_VERSION = (
     sys.executable,
@@ -98,3 +106,26 @@ def test_what_the_config_has_wrong_is_said_before_anything_is_begun(here):
         with up(config, "--set", override) as running:
             assert said in sentence(running.process, 2)
             assert not running.out.exists()
+
+
+def test_a_log_that_is_not_whole_is_refused_with_the_same_sentence_each_time(here):
+    """Who was refused holds nothing of the file: after the damage is mended it can be opened in the same process."""
+    config, path = small_config(8), here / "log.sqlite"
+    run = Distributed(config, Wire(f"unixsock-stream/{here}/k.sock", "example"), path)
+    run.open()
+    try:
+        for role in SENDERS:
+            run.start(role)
+        run.join()
+    finally:
+        run.close()
+    whole = path.read_bytes()
+    with closing(sqlite3.connect(path)) as damaged:
+        damaged.execute("DELETE FROM records WHERE pass = 4 AND stage = 1")
+        damaged.commit()
+    for _ in range(2):
+        with pytest.raises(ResultsError, match="holds no whole log"):
+            open_ledger(config, path, "normal")
+    path.write_bytes(whole)
+    with open_ledger(config, path, "normal").store as store:
+        assert store.last(0) == (8, 8, 8, 8)

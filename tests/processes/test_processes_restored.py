@@ -14,9 +14,9 @@ from real_processes import events, store
 from roles_on_threads import Paced, Roles, paced
 
 from adapters.buses.messages import State
-from adapters.buses.wire import ROLES
 from adapters.processes import serve
 from adapters.processes.role import plain
+from adapters.roles import ROLES
 from mape.errors import PartError
 from mape.plan.morphin import Morphin
 

@@ -313,9 +313,3 @@ def test_what_the_command_refuses_is_usage_and_changes_nothing(keys, capsys, opt
     assert sentence in said.err
     assert said.out == ""
     assert contents(keys) == before
-
-
-def test_roles_are_the_components_of_a_loop():
-    from adapters.buses import wire
-
-    assert security.STAGES == wire.ROLES

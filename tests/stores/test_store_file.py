@@ -188,6 +188,17 @@ def another_application(path):
         db.executescript("CREATE TABLE bookmarks (url TEXT);")
 
 
+def another_application_with_a_write_ahead_log(path):
+    with closing(sqlite3.connect(path)) as db:
+        db.executescript("PRAGMA journal_mode = WAL; CREATE TABLE bookmarks (url TEXT);")
+
+
+def another_version_with_a_write_ahead_log(path):
+    another_version(path)
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("PRAGMA journal_mode = WAL")
+
+
 def another_version(path):
     Store(path).close()
     with closing(sqlite3.connect(path)) as db:
@@ -219,6 +230,8 @@ def a_torn_file(path):
     [
         (another_application, "is no log of a run; name the folder or file"),
         (another_version, f"has schema version {VERSION + 1}; this mapek reads version {VERSION}"),
+        (another_application_with_a_write_ahead_log, "is no log of a run; name the folder or file"),
+        (another_version_with_a_write_ahead_log, f"has schema version {VERSION + 1}"),
         (a_text, "cannot be opened as a log: file is not a database"),
         (a_short_text, "cannot be opened as a log: file is not a database"),
         (a_folder, "cannot be written: Is a directory; choose another folder|there is no log"),
