@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, Record, RowLayout, Symptom
+from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, QTable, Record, RowLayout, Symptom
 from mape.analyze import Analyze
 from mape.bus import LocalBus
 from mape.config import Config, SwapConfig
@@ -23,11 +23,11 @@ from mape.errors import ConfigError
 from mape.execute import Execute
 from mape.execute.component import SIGNALS
 from mape.monitor import Monitor
-from mape.parts import make
+from mape.parts import make, owner
 from mape.plan import Plan
-from mape.ports import ManagedSystem
+from mape.ports import Json, ManagedSystem
 from mape.stretch.stretches import Stretches, obstacles
-from mape.swap import Component, owner, replace_part
+from mape.swap import Component, replace_part
 
 Send = Callable[[Any], object]
 
@@ -69,9 +69,15 @@ def build_plan(config: Config, knowledge: Knowledge, send: Send) -> Plan:
 
 
 def build_execute(
-    config: Config, system: ManagedSystem, knowledge: Knowledge, send: Send, trial: int = 0, loop: int = 0
+    config: Config,
+    system: ManagedSystem,
+    knowledge: Knowledge,
+    send: Send,
+    trial: int = 0,
+    loop: int = 0,
+    checkpoint: tuple[Json, QTable] | None = None,
 ) -> Execute:
-    """Make the Execute that a config describes, over a fresh system."""
+    """Make the Execute that a config describes, over a fresh system; from a checkpoint on, if there is one."""
     return Execute(
         system,
         make("learner", config.learner),
@@ -83,6 +89,7 @@ def build_execute(
         engine=config.execute.engine,
         mask_greedy=config.execute.mask_greedy,
         max_actions=config.system.max_actions,
+        checkpoint=checkpoint,
     )
 
 

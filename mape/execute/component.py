@@ -48,6 +48,18 @@ class Execute:
         Whether the system's action mask limits the greedy choice and the TD target too, not only exploration.
     max_actions
         Largest number of actions that the run's records can hold.
+    checkpoint
+        State and Q-table, as `state` gives them. This Execute goes on from there, as by `restore`, but resets its
+        system for no episode that is over.
+
+    Raises
+    ------
+    ConfigError
+        The engine is ``"compiled"``, and the system offers no rules, or some that cannot be compiled.
+    ManagedSystemError
+        The system raised at its reset, offers no legal action, or does not go on from what the checkpoint carries.
+    PartError
+        The checkpoint is not of an Execute of the same config.
     """
 
     def __init__(
@@ -63,6 +75,7 @@ class Execute:
         engine: str = "auto",
         mask_greedy: bool = False,
         max_actions: int = 64,
+        checkpoint: tuple[Json, QTable] | None = None,
     ) -> None:
         self.system = system
         self.learner = learner
@@ -99,12 +112,15 @@ class Execute:
         self._rate = rate_array((0.0,) * len(learner.rate_names))
 
         self._begun = 0  # the episode whose reset has been done ahead of its drive
-        first = system.available(1)
-        if first is None:  # only a reset can tell; episode 1 then goes on from it
-            first = self._begin(1, self.uniforms.find(0))
-            self._begun = 1
-        self._take_actions(first, 1)
-        self._set_table(QTable(first, system.n_states))
+        if checkpoint is None:
+            first = system.available(1)
+            if first is None:  # only a reset can tell; episode 1 then goes on from it
+                first = self._begin(1, self.uniforms.find(0))
+                self._begun = 1
+            self._take_actions(first, 1)
+            self._set_table(QTable(first, system.n_states))
+        else:
+            self.restore(*checkpoint)
         knowledge.serve_q_table(lambda: self.q_table.copy())
 
     def record_trace(self, first: int, last: int, listener: Callable[[int, npt.NDArray[np.float64]], object]) -> None:
@@ -163,10 +179,11 @@ class Execute:
             else:
                 available = self._begin(number, at)
         if available is not self.available:
-            self._take_actions(available, number)
-            self._set_rows()
+            check_offer(available, self.system, number, self._max_actions)
+            self._set_rows(available)
         tracing = number in self._traced
         trace = np.empty((self.system.max_steps, len(episode.TRACE_COLUMNS))) if tracing else self._no_trace
+        self._workspace.forget()
         try:
             status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
         except BaseException as error:
@@ -368,18 +385,19 @@ class Execute:
         self.q_table = table
         self._workspace.open(table)
         self._knowledge.actions = table.actions
-        self._set_rows()
+        self._set_rows(self.available)
         # A table of a single row has another type in compiled code than one of several.
         self._drive = self._bound(self.learner)
 
-    def _set_rows(self) -> None:
-        if not self._workspace.offer(self.available):
+    def _set_rows(self, available: tuple[int, ...]) -> None:
+        if not self._workspace.offer(available):
             raise ManagedSystemError(
-                f"{self.system.name} offers actions {self.available}, of which the Q-table knows none: it has "
+                f"{self.system.name} offers actions {available}, of which the Q-table knows none: it has "
                 f"{self.q_table.actions}. A new action is first tried in the episode after the one that reports it, so "
                 "at least one known action must stay."
             )
         self._fix_arguments()
+        self.available = available
 
     def _enable(self, plan: ChangePlan) -> None:
         adoption.enable(plan, self.system)

@@ -34,12 +34,14 @@ class Workspace:
         # Stamps are episode numbers, from 1: a fresh table is untouched.
         self._touched = np.zeros(table.values.shape, dtype=np.int64, order="F")
         self._actions = np.array(table.actions, dtype=np.int64)
+        self.forget()
 
     def offer(self, available: tuple[int, ...]) -> bool:
-        """Let them use the rows of `available`; say whether there are any."""
+        """Let them use the rows of `available`; say whether there are any, and if not, leave all as it was."""
         usable = [row for row, action in enumerate(self._table.actions) if action in available]
-        self._rows = np.array(usable, dtype=np.int64)
-        self._choices = np.empty_like(self._rows)
+        if usable:
+            self._rows = np.array(usable, dtype=np.int64)
+            self._choices = np.empty_like(self._rows)
         return bool(usable)
 
     @property
@@ -48,8 +50,13 @@ class Workspace:
         values = self._table.values
         return values, self._touched, self._journal, self._saved, self.used, self._rows, self._choices, self._actions
 
+    def forget(self) -> None:
+        """Let what the last episode wrote stand: an episode that is broken off before it begins has written nothing."""
+        self.used[0] = 0
+        self.used[1] = -1
+
     def roll_back(self) -> None:
-        """Make the table what it was before the last episode."""
+        """Make the table what it was before the last episode, if that is not forgotten."""
         pairs = np.divmod(self._journal[: int(self.used[0])], self._table.n_states)
         self._table.values[pairs] = self._saved[: len(pairs[0])]
         # Driven again, the episode saves these pairs anew.

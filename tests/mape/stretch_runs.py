@@ -15,8 +15,8 @@ from knowledge import STAGES, ChangePlan
 from mape.config import from_table
 from mape.errors import ConfigError, MapekError
 from mape.loop import Loop
+from mape.parts import config_at
 from mape.registry import PARTS, find
-from mape.swap import config_at
 
 PASSES = 60
 """The longest piece in which a run is made; what happens in it happens up to there, as a rule."""

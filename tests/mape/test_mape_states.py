@@ -16,7 +16,7 @@ from mape.config import from_table
 from mape.errors import ConfigError, ManagedSystemError, PartError
 from mape.execute.uniforms import Uniforms
 from mape.loop import Loop
-from mape.swap import config_at
+from mape.parts import config_at
 
 CALLED = {
     "frozen_lake": {"id": "FrozenLake-v1", "options": {"map_name": "4x4"}},
