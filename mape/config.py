@@ -19,7 +19,7 @@ from mape import registry
 from mape.errors import ConfigError, UnknownName
 from mape.parts import owner, parts_in, place_of, with_part
 from mape.specs import PartConfig, PartSpec, explain
-from mape.tables import merge, parse_override, read_table
+from mape.tables import TOO_DEEP, Table, merge, parse_override, read_table, refuse_infinity
 
 
 class DetectorSpec(PartSpec):
@@ -218,6 +218,10 @@ class Config(PartConfig):
             raise ConfigError(f"loop {loop} is not one of the {self.loops} loops of a trial, which count from 0")
         return trial * self.loops + loop
 
+    def unit_name(self, trial: int, loop: int) -> str:
+        """Return what a unit is called in messages: ``trial 3``, or ``trial 3, loop 1`` where a trial has several."""
+        return f"trial {trial}" if self.loops == 1 else f"trial {trial}, loop {loop}"
+
     def to_json(self) -> str:
         """Write the config as JSON, from which `from_table` makes it again."""
         return json.dumps(self.model_dump(mode="json", by_alias=True), sort_keys=True)
@@ -235,9 +239,12 @@ def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
         # From JSON text, where a list may stand for a tuple even in strict mode.
         config = Config.model_validate_json(json.dumps(table, default=lambda value: _refuse(value, where)))
     except ValidationError as error:
+        if "recursion limit" in error.errors()[0]["msg"]:  # pydantic's, which is below Python's
+            raise ConfigError(f"{where} holds {TOO_DEEP}") from None
         raise ConfigError(explain(error, f"{where}: ", Config)) from None
     for kind, path, spec in parts_of(config):
         registry.options_of(kind, spec, f"{where}: {path}")
+    refuse_infinity(table, f"{where}: ")  # of options that no model has looked at
     return config
 
 
@@ -279,11 +286,18 @@ def load(
     ConfigError
         The file cannot be read, or what it says is not legal.
     """
+    chosen = [f"{kind} {name}" for kind, name in (("profile", profile), ("agent", agent)) if name is not None]
+    try:
+        return from_table(_laid_over(path, profile, agent, overrides), ", ".join([str(path), *chosen]))
+    except RecursionError:
+        raise ConfigError(f"{path}, with what is laid over it, holds {TOO_DEEP}") from None
+
+
+def _laid_over(path: str | Path, profile: str | None, agent: str | None, overrides: Iterable[str]) -> Table:
     table = read_table(path)
     for kind, chosen in (("profile", profile), ("agent", agent)):
-        overlays = table.pop(f"{kind}s", {})
-        if not isinstance(overlays, dict):
-            raise ConfigError(f"{path}: {kind}s is a table of tables, [{kind}s.NAME]")
+        overlays = _overlays(path, table, kind)
+        table.pop(f"{kind}s", None)
         if chosen is not None:
             if chosen not in overlays:
                 raise UnknownName(kind, chosen, overlays, f"They are the [{kind}s.NAME] tables of {path}.")
@@ -292,12 +306,25 @@ def load(
             table = merge(table, overlays[chosen])
     for override in overrides:
         table = merge(table, parse_override(override))
-    return from_table(table, str(path))
+    return table
 
 
 def overlays_of(path: str | Path, kind: str) -> list[str]:
-    """Return the names of a file's profiles or agents, in its order."""
-    return list(read_table(path).get(f"{kind}s", {}))
+    """Return the names of a file's profiles or agents, in its order.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read, or they are no tables.
+    """
+    return list(_overlays(path, read_table(path), kind))
+
+
+def _overlays(path: str | Path, table: Table, kind: str) -> Table:
+    overlays: Any = table.get(f"{kind}s", {})
+    if not isinstance(overlays, dict):
+        raise ConfigError(f"{path}: {kind}s is a table of tables, [{kind}s.NAME]")
+    return overlays
 
 
 def _refuse(value: Any, where: str) -> Any:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import sysconfig
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from mape.errors import ConfigError
 
 Table = dict[str, Any]
+
+TOO_DEEP = "tables or lists within one another, more than can be read; a config has a few levels"
+"""What is said of them."""
 
 
 def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
@@ -27,6 +31,8 @@ def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
         kind = "JSON" if path.suffix == ".json" else "TOML"
         raise ConfigError(f"{path} is not valid {kind}: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{path} holds {TOO_DEEP}") from None
     if not isinstance(table, dict):
         raise ConfigError(f"{path} holds no table")
     base = table.pop("extends", None)
@@ -89,14 +95,53 @@ def parse_override(text: str) -> Table:
     return table
 
 
+def refuse_infinity(table: Mapping[str, Any], where: str) -> None:
+    """Refuse a table with a number that is not finite: written as JSON, to be kept or sent, it would become another.
+
+    Raises
+    ------
+    ConfigError
+        Names the number and where it stands, after `where`.
+    """
+    for name, number in _floats(table):
+        if not math.isfinite(number):
+            raise ConfigError(
+                f"{where}{name} = {number} is no finite number, and JSON, as which options are kept and sent, has no "
+                "other; give a very large number for infinity, or leave the option out"
+            )
+
+
+def _floats(value: Any, at: str = "") -> Iterator[tuple[str, float]]:
+    if isinstance(value, float):
+        yield at, value
+    elif isinstance(value, Mapping):
+        for key, one in value.items():
+            yield from _floats(one, f"{at}.{key}" if at else str(key))
+    elif isinstance(value, (list, tuple)):
+        for i, one in enumerate(value):
+            yield from _floats(one, f"{at}[{i}]")
+
+
+class _Nothing:
+    def __repr__(self) -> str:
+        return "nothing"
+
+
+NOTHING = _Nothing()
+"""Stands for the value of a name that a table does not have; None is a value."""
+
+
 def first_difference(one: Any, other: Any, at: str = "") -> tuple[str, Any, Any]:
-    """Return the dotted name at which two tables first differ, and what stands there in each.
+    """Return the dotted name at which two tables first differ, and what stands there in each, `NOTHING` among it.
 
     >>> first_difference({"plan": {"alpha": 0.1, "k": 5}}, {"plan": {"alpha": 0.2, "k": 5}})
     ('plan.alpha', 0.1, 0.2)
+    >>> first_difference({"plan": {"k": None}}, {"plan": {}})
+    ('plan.k', None, nothing)
     """
     if isinstance(one, Mapping) and isinstance(other, Mapping):
         for key in [*one, *other]:
-            if one.get(key) != other.get(key):
-                return first_difference(one.get(key), other.get(key), f"{at}.{key}" if at else str(key))
+            here, there = (table.get(key, NOTHING) for table in (one, other))
+            if here != there:
+                return first_difference(here, there, f"{at}.{key}" if at else str(key))
     return at, one, other

@@ -22,7 +22,8 @@ class TrialResult(NamedTuple):
     """What one trial came to, or one loop of it.
 
     `alarms` are the episodes at whose end a detector alarmed; `handed_over` says of each swap that was made whether
-    the new part took over the state of the old one.
+    the new part took over the state of the old one. `dropped` is the number of passes of a free-running loop of which
+    there is no record.
     """
 
     trial: int
@@ -33,6 +34,7 @@ class TrialResult(NamedTuple):
     q_table_sha256: str
     loop: int = 0
     handed_over: tuple[bool, ...] = ()
+    dropped: int = 0
 
 
 def run_trial(
@@ -73,8 +75,9 @@ def run_trial(
 
         def count(rows: npt.NDArray[np.void]) -> None:
             nonlocal steps
-            steps += int(rows["steps"].sum())
-            alarms.extend(rows["pass"][rows["alarm"].any(axis=1)].tolist())
+            more, alarmed = steps_and_alarms(rows)
+            steps += more
+            alarms.extend(alarmed)
 
         running.log.on_rows(count)
         running.on_swap(lambda swap, kept: handed_over.append(kept))
@@ -100,16 +103,21 @@ def run_trial(
         return result
     except MapekError as error:
         if config.units > 1 and not str(error).startswith("trial "):
-            told = f"trial {trial}" if config.loops == 1 else f"trial {trial}, loop {loop}"
-            error.args = (f"{told}: {error}",)
+            error.args = (f"{config.unit_name(trial, loop)}: {error}",)
         raise
     finally:
         system.close()
 
 
+def steps_and_alarms(rows: npt.NDArray[np.void]) -> tuple[int, list[int]]:
+    """Return the number of steps of some of the log's rows, and the episodes at whose end a detector alarmed."""
+    return int(rows["steps"].sum()), rows["pass"][rows["alarm"].any(axis=1)].tolist()
+
+
 def combined_hash(hashes: Iterable[str]) -> str:
-    """Hash the hashes of all units, the loops of all trials, in the order of their numbers."""
-    return hashlib.sha256("".join(hashes).encode()).hexdigest()
+    """Return one hash for all units, the loops of all trials: of several, that of their hashes, in order."""
+    each = list(hashes)
+    return each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()
 
 
 def chunks(units: Sequence[int], size: int) -> list[tuple[int, int]]:

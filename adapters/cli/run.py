@@ -62,6 +62,7 @@ def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
                 **({"loop": r.loop} if config.loops > 1 else {}),
                 "alarms": list(r.alarms),
                 "total_steps": r.total_steps,
+                **({"dropped": r.dropped} if config.execute.mode == "free" else {}),
                 "log_sha256": r.log_sha256 or None,
                 "q_table_sha256": r.q_table_sha256,
             }
@@ -73,21 +74,27 @@ def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
 
 
 def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], last: npt.NDArray[Any]) -> None:
-    """Print what came out; `last` are the returns of the last episodes of each unit."""
+    """Print what came out; `last` are the returns of the last episodes of each unit, NaN where one was dropped."""
     steps = summary(np.array([r.total_steps for r in results]))
-    late = summary(last.mean(axis=1))
     say(chosen, f"{config.name}: {config.description or config.system.id}")
     say(chosen, f"system:   {config.system.id}")
     loops = f", loops of each: {config.loops:,}" if config.loops > 1 else ""
     say(chosen, f"episodes: {config.episodes:,}, trials: {config.trials:,}{loops}, seed: {config.seed}")
+    if dropped := sum(r.dropped for r in results):
+        say(chosen, f"dropped:  {dropped:,} episodes of which there is no record: what follows is of the others")
     for swap, handed_over in zip(config.swap, results[0].handed_over, strict=True):
         say(chosen, swap_sentence(swap, handed_over))
     unit, units = ("trial", "trials") if config.loops == 1 else ("loop", "loops of all trials")
+    of_all = f" (of all {units})" if config.units > 1 else ""
     if config.units == 1:
         say(chosen, f"steps:    {results[0].total_steps:,} in total")
     else:
         say(chosen, f"steps:    {_with_sd(steps)} per {unit}")
-    say(chosen, f"return:   {_with_sd(late)}, mean of the last {last.shape[1]} episodes")
+    if (recorded := ~np.isnan(last)).any(axis=1).all():
+        late = summary(np.mean(last, axis=1, where=recorded))
+        say(chosen, f"return:   {_with_sd(late)}, mean of the last {last.shape[1]} episodes")
+    else:
+        say(chosen, f"return:   of none of the last {last.shape[1]} episodes there is a record")
     if config.units == 1:
         alarms = ", ".join(map(str, results[0].alarms)) or "none"
         say(chosen, f"alarms:   {alarms}" + (" (episodes)" if results[0].alarms else ""))
@@ -95,14 +102,10 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
         say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per {unit}")
     if config.execute.mode == "free":
         say(chosen, "log:      no hash, as no free-running loop is the same twice")
-    elif config.units == 1:
-        say(chosen, f"log:      {results[0].log_sha256}")
     else:
-        say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)} (of all {units})")
-    if config.units == 1:
-        say(chosen, f"Q-table:  {results[0].q_table_sha256}")
-    else:
-        say(chosen, f"Q-tables: {combined_hash(r.q_table_sha256 for r in results)} (of all {units})")
+        say(chosen, f"log:      {combined_hash(r.log_sha256 for r in results)}{of_all}")
+    tables = "Q-table: " if config.units == 1 else "Q-tables:"
+    say(chosen, f"{tables} {combined_hash(r.q_table_sha256 for r in results)}{of_all}")
 
 
 def _with_sd(found: Any) -> str:

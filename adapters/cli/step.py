@@ -25,7 +25,7 @@ def execute(chosen: argparse.Namespace) -> int:
     loop = Loop(config, make_system(config.system))
     loop.on_swap(lambda swap, handed_over: print(swap_sentence(swap, handed_over)))
     try:
-        print(f"{config.name}, trial 0, seed {config.seed}. {HELP}.")
+        print(f"{config.name}, {config.unit_name(0, 0)}, seed {config.seed}. {HELP}.")
         if chosen.first > 1:
             loop.run(chosen.first - 1)
         while loop.log.passes < config.episodes:
@@ -40,6 +40,9 @@ def execute(chosen: argparse.Namespace) -> int:
                 print(f"--- pass {record.pass_no}")
             elif isinstance(record, ChangePlan) and record.pass_no == 0:
                 print("--- start")
+            print(sentence(record))
+        # The last plan drives no episode, but is a record of its pass.
+        while (record := loop.bus.deliver()) is not None:
             print(sentence(record))
         print(f"the run ends after {config.episodes} passes. log {loop.log.sha256()}")
     finally:

@@ -18,7 +18,7 @@ from adapters.stores.ledger import Ledger
 from knowledge import ChangePlan, ChangeRequest, Observation, RowLayout, Symptom, from_json
 from mape.config import Config
 from mape.errors import ResultsError
-from mape.trials import TrialResult
+from mape.trials import TrialResult, steps_and_alarms
 
 
 def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
@@ -37,13 +37,15 @@ def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
     with whole(stem.with_suffix(".rows")) as file:
         for unit in range(ledger.units):
             trial, loop = divmod(unit, config.loops)
-            steps, alarms = 0, []
+            steps, dropped, alarms = 0, 0, []
             for rows in rows_of(ledger, unit):
                 block = from_rows(trial, loop, rows).tobytes()
                 digest.update(block)
                 file.write(block)
-                steps += int(rows["steps"].sum())
-                alarms += rows["pass"][rows["alarm"].any(axis=1)].tolist()
+                more, alarmed = steps_and_alarms(rows)
+                steps += more
+                alarms += alarmed
+                dropped += int(np.isnan(rows["epsilon"]).sum())
             found = ledger.store.snapshot(unit, "execute")
             if found is None or found.table is None:
                 raise ResultsError(f"{ledger.store.path} has no Q-table of the end of loop {unit}")
@@ -54,7 +56,15 @@ def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
             handed_over = tuple(swaps.get((swap.pass_no, swap.part), False) for swap in config.swap)
             results.append(
                 TrialResult(
-                    trial, config.episodes, steps, tuple(alarms), sha256, found.table.sha256(), loop, handed_over
+                    trial,
+                    config.episodes,
+                    steps,
+                    tuple(alarms),
+                    sha256,
+                    found.table.sha256(),
+                    loop,
+                    handed_over,
+                    dropped,
                 )
             )
     write_heads(stem, results, arrays, len(results) * config.episodes, digest.hexdigest())
@@ -64,7 +74,7 @@ def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
 def rows_of(ledger: Ledger, unit: int) -> Iterator[npt.NDArray[np.void]]:
     """Yield the packed passes of one loop, in blocks; of a free-running one as far as they are whole.
 
-    A free-running loop's pass that was dropped has no steps and a return that is no number.
+    A free-running loop's pass that was dropped has no steps, and numbers that are none.
     """
     layout = ledger.layout
     assert layout is not None
@@ -92,5 +102,5 @@ def rows_of(ledger: Ledger, unit: int) -> Iterator[npt.NDArray[np.void]]:
 def _dropped(layout: RowLayout, number: int) -> npt.NDArray[np.void]:
     row = np.zeros(1, layout.dtype)
     row["pass"] = number
-    row["signals"] = np.nan
+    row["epsilon"] = row["signals"] = np.nan
     return row

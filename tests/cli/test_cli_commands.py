@@ -136,6 +136,16 @@ def test_step_runs_to_a_pass_and_on_to_the_end(mapek: Mapek, monkeypatch: pytest
     assert outcome.out.splitlines()[-1].endswith(f"log {whole['trials'][0]['log_sha256']}")
 
 
+def test_step_shows_the_last_plan_too(mapek: Mapek, monkeypatch: pytest.MonkeyPatch) -> None:
+    step_with(monkeypatch, "\n" * 20)
+    outcome = mapek("step", GOALS, "--set", "episodes=2")
+
+    assert [line.split("] ")[-1].split(",")[0] for line in outcome.out.splitlines()][-2:] == [
+        "Plan      plan 2: epsilon 0.914",
+        f"the run ends after 2 passes. log {outcome.out.split()[-1]}",
+    ]
+
+
 def test_step_can_begin_later(mapek: Mapek, monkeypatch: pytest.MonkeyPatch) -> None:
     step_with(monkeypatch, "\nq\n")
     outcome = mapek("step", GOALS, "--from", 4)

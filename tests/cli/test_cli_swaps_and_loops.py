@@ -106,6 +106,13 @@ def test_json_lists_every_loop_of_every_trial_in_order(mapek: Mapek) -> None:
     assert found["q_table_sha256"] == combined_hash(one["q_table_sha256"] for one in found["trials"])
 
 
+def test_a_run_of_one_loop_has_one_hash(mapek: Mapek) -> None:
+    found = mapek("run", GOALS, "--set", "episodes=12", *PIPED).json
+
+    (only,) = found["trials"]
+    assert (found["log_sha256"], found["q_table_sha256"]) == (only["log_sha256"], only["q_table_sha256"])
+
+
 def test_the_loops_of_a_run_are_the_same_however_they_are_divided_among_workers(mapek: Mapek) -> None:
     one, two = (
         mapek("run", GOALS, *LOOPS, "--no-figures", "-q", "--workers", workers, "--json", "-").json
@@ -177,3 +184,11 @@ def test_reproduce_counts_trials_and_no_loops(mapek: Mapek) -> None:
 
     assert outcome.code == 2
     assert "loops = 2 would count each trial several times" in outcome.err
+
+
+def test_a_swap_to_a_part_with_an_infinite_option_is_refused_before_anybody_is_asked(mapek: Mapek) -> None:
+    outcome = mapek("swap", "monitor", '{name = "own:Floor", floor = -inf}', "--connect", "tcp/127.0.0.1:9")
+
+    assert outcome.code == 2
+    assert "floor = -inf is no finite number" in outcome.err
+    assert "JSON" in outcome.err

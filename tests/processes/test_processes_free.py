@@ -132,6 +132,7 @@ def test_what_a_small_backlog_drops_while_knowledge_is_away_is_one_row(here):
     assert [event.text.split()[0] for event in events(log, "dropped")] == [str(count) for count in counts]
     said = run("log", str(log), "--events", "--pass", str(dropped[0][0]), cwd=here).stdout
     assert f"{counts[0]} episodes" in said
-    assert json.loads((here / "served" / "result.json").read_bytes())["passes"] == total
+    result = json.loads((here / "served" / "result.json").read_bytes())
+    assert (result["passes"], result["trials"][0]["dropped"]) == (total, sum(counts))
     assert events(log, "refused") == []
     print(f"dropped {dropped}")

@@ -107,11 +107,14 @@ def test_behind_a_rate_that_cannot_be_reached_plans_and_acknowledgements_are_hea
     backlog, total = 200, 4000
     config = write_config(here, json.loads(free(total, 1e5, backlog, "python").to_json()) | {"analyze": "changes"})
     with up(config) as running:
-        running.result()
+        result = running.result()
     seen, gaps = observations(running.log), dropped(running.log)
     plans = sorted({one.plan for one in seen})
     print(f"{len(seen)} episodes in the log, {len(gaps)} gaps {gaps[:9]}; {len(plans)} plans, up to {plans[-1]}")
-    assert len(seen) + sum(final - first + 1 for first, final in gaps) == total
+    missing = sum(final - first + 1 for first, final in gaps)
+    assert len(seen) + missing == total
+    assert result["trials"][0]["dropped"] == missing
+    assert f"dropped:  {missing:,} episodes of which there is no record" in running.process.said
     # Who hears nothing fills its backlog once, and drives on under plan 0.
     assert len(seen) > 2 * backlog
     assert plans[-1] > backlog
