@@ -76,9 +76,6 @@ class LocalBus:
             delivered += 1
         return delivered
 
-    def connect(self) -> None:
-        """Do nothing: within a process all is connected."""
-
     def close(self) -> None:
         """Drop what still waits and all handlers, and take nothing more; the log keeps what it has."""
         self._waiting.clear()

@@ -31,12 +31,17 @@ from typing import Any
 
 import numpy as np
 
+from mape.ctrl_c import CtrlC
 from mape.errors import ConfigError
 
 Rule = Callable[..., Any]
 Bindings = Mapping[str, "Rule | Composed"]
 on_compile: list[Callable[[str], object]] = []
 """Called with a sentence before something is compiled that is not in the cache."""
+
+
+class Uncompilable(ConfigError):
+    """A rule that is no module-level function, or that Numba does not compile."""
 
 
 class Composed:
@@ -86,6 +91,7 @@ class Composed:
                     rule._write(imports, means, body, alias, "@njit(forceinline=True, _nrt=False)")
                     continue
                 rule = rule.compiled().py_func
+            _check_importable(rule)
             imports[alias] = f"from {rule.__module__} import {rule.__qualname__} as {alias}"
         for used in sorted(_names(template.__code__)):
             if used in template.__globals__ and used not in self.bindings:
@@ -101,19 +107,33 @@ class Composed:
     def rules(self) -> Iterator[Rule]:
         """Yield the template and every rule that it reaches, each once."""
         seen: set[int] = set()
+        for _, rule in self._reached():
+            if id(rule) not in seen:
+                seen.add(id(rule))
+                yield rule
+
+    @property
+    def compiled_by_others(self) -> bool:
+        """Whether it reaches a function that its author compiled, which a call in plain Python would compile too."""
+        return any(found is not rule for found, rule in self._reached())
+
+    def _reached(self) -> Iterator[tuple[Any, Rule]]:
+        """Yield each function that is reached: as it is found, and as it is in plain Python."""
+        seen: set[int] = set()
         pending: list[Any] = [self]
         while pending:
-            item = pending.pop()
-            if isinstance(item, Composed):
-                pending += item.bindings.values()
-                item = item.template
-            item = getattr(item, "py_func", item)  # a function that its author compiled already
-            if id(item) in seen or not isinstance(item, FunctionType):
+            found = pending.pop()
+            if isinstance(found, Composed):
+                pending += found.bindings.values()
+                found = found.template
+            item = getattr(found, "py_func", found)
+            if not isinstance(item, FunctionType):
                 continue
-            seen.add(id(item))
-            yield item
-            # Of a module's functions only those that their author compiled can be called by way of the module.
-            pending += [value for name, value in _found(item) if "." not in name or hasattr(value, "py_func")]
+            yield found, item
+            if id(item) not in seen:
+                seen.add(id(item))
+                # Of a module's functions only those that their author compiled can be called by way of the module.
+                pending += [value for name, value in _found(item) if "." not in name or hasattr(value, "py_func")]
 
     def compiled(self) -> Any:
         """Return the bound function as a Numba dispatcher, from the cache where it can be.
@@ -121,17 +141,31 @@ class Composed:
         Raises
         ------
         ConfigError
-            A rule is no module-level function, so that no module could import it.
+            A rule is no module-level function, so that no module could import it: an `Uncompilable`. Or compiled code
+            can be kept nowhere.
+        KeyboardInterrupt
+            After a Ctrl-C, when that is done.
         """
-        rules = tuple(self.rules())
-        for rule in rules:
-            if rule.__qualname__ != rule.__name__ or rule.__name__ == "<lambda>":
-                raise ConfigError(
-                    f"{rule.__module__}.{rule.__qualname__} cannot be compiled: a rule is a module-level function. "
-                    "Move it out of its class or function, or choose the engine 'python'."
-                )
-        text = self.source()
-        return _load(text, _fingerprint(text, rules), self.template.__name__, rules)
+        with CtrlC():
+            rules = tuple(self.rules())
+            for rule in rules:
+                _check_importable(rule)
+            text = self.source()
+            return _load(text, _fingerprint(text, rules), self.template.__name__, rules)
+
+
+def _check_importable(rule: Any) -> None:
+    name = getattr(rule, "__qualname__", None)
+    if name is None:
+        raise Uncompilable(
+            f"{_without_addresses(repr(rule))} cannot be compiled: a rule is a module-level function. Write one, or "
+            "choose the engine 'python'."
+        )
+    if name != rule.__name__ or name == "<lambda>":
+        raise Uncompilable(
+            f"{rule.__module__}.{name} cannot be compiled: a rule is a module-level function. Move it out of its class "
+            "or function, or choose the engine 'python'."
+        )
 
 
 @functools.cache
@@ -252,16 +286,20 @@ def specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
     """Return the machine code of `dispatcher` for the types of `arguments`, compiling it where the cache has none.
 
     It skips the dispatcher's look at the types of each argument, which would cost more than an episode's arithmetic;
-    the caller therefore passes the same types every time. `what` is compiled, it says where it has to be.
+    the caller therefore passes the same types every time. `what` is compiled, it says where it has to be, or where it
+    cannot and Numba names no rule.
 
     Raises
     ------
-    ConfigError
+    Uncompilable
         Numba cannot compile a rule.
+    KeyboardInterrupt
+        After a Ctrl-C, when it is compiled: LLVM calls Python, and loses what is raised there.
     """
     key = (dispatcher, _kind(arguments))
     if key not in _special:
-        _special[key] = _specialise(dispatcher, arguments, what)
+        with CtrlC() as ctrl_c:
+            _special[key] = _specialise(dispatcher, arguments, what, ctrl_c)
     return _special[key]
 
 
@@ -278,10 +316,13 @@ def _kind(argument: Any) -> Any:
     return type(argument)
 
 
-def _specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
+def _specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str, ctrl_c: CtrlC) -> Rule:
     import numba
 
-    signature = tuple(numba.typeof(argument) for argument in arguments)  # type: ignore[no-untyped-call]
+    try:
+        signature = tuple(numba.typeof(argument) for argument in arguments)  # type: ignore[no-untyped-call]
+    except Exception as error:
+        raise _uncompilable(error, what) from error
     if signature not in dispatcher.overloads:
         folder = Path(dispatcher.py_func.__code__.co_filename).parent
         if not any(folder.glob("__pycache__/*.nbc")):
@@ -290,17 +331,27 @@ def _specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
         try:
             dispatcher.compile(signature)
         except Exception as error:  # Numba's own, and what it meets while it looks at a rule
-            raise ConfigError(
-                f"{_why_not(error)} Choose the engine 'python' to run it as it is, or keep to what Numba compiles."
-            ) from error
+            if ctrl_c.heard:  # a second one, perhaps in a call by LLVM: lost there, with what was compiled
+                raise KeyboardInterrupt from error
+            raise _uncompilable(error, what) from error
     return dispatcher.overloads[signature].entry_point  # type: ignore[no-any-return]
 
 
-def _why_not(error: Exception) -> str:
+def _uncompilable(error: Exception, what: str) -> Uncompilable:
+    return Uncompilable(
+        f"{_why_not(error, what)} Choose the engine 'python' to run it as it is, or keep to what Numba compiles."
+    )
+
+
+def _without_addresses(text: str) -> str:
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
+
+
+def _why_not(error: Exception, what: str) -> str:
     """Say which rule Numba does not compile, and why, in place of its account of all that it tried."""
     lines = [line.strip() for line in str(error).splitlines()]
     names = re.findall(r"Function\(<function (\w+) at ", str(error))
-    rule = f"rule {names[0]}" if names else "a rule"
+    rule = f"rule {names[0]}" if names else what
     if any(line.startswith(("NRT required", "Only accept returning of array")) for line in lines):
         return (
             f"{rule} cannot be compiled by Numba: it makes an array, a list or a text, and compiled rules allocate "
@@ -314,4 +365,4 @@ def _why_not(error: Exception) -> str:
     why = next(iter(calls or reasons or lines), type(error).__name__)
     if why.endswith("found for signature:"):
         why += " " + next((line for line in lines[lines.index(why) :] if line.startswith(">>>")), "")
-    return f"{rule} cannot be compiled by Numba: {why.rstrip('.')}."
+    return f"{rule} cannot be compiled by Numba: {_without_addresses(why).rstrip('.')}."

@@ -13,13 +13,13 @@ A detector, analyzer, schedule or planner may also have
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from knowledge import ChangePlan, ChangeRequest, Knowledge, Record, Symptom
+from knowledge import ChangePlan, ChangeRequest, Knowledge, Symptom
 from knowledge.records import Direction
 
 Json = Any
@@ -45,6 +45,9 @@ class QuietRule(NamedTuple):
         `signals` are the signals of the pass in the order of the run, from the return on. Of what is computed, plain
         Python and Numba give the same bits for ``+ - * /``, `math.sqrt`, `exp`, `log` and the like; not for ``**``,
         `math.hypot`, `gamma` and `lgamma`. Outside of a function's domain, where Python raises, Numba gives NaN.
+        An index beyond state, params or signals, where Python raises, reads or writes other memory. So each rule is
+        called in Python before it is compiled, once in a process, and refused if it always reaches beyond its numbers;
+        a negative index, and what a rule does but rarely, only `mapek check` can find.
     state : the numbers that the part carries, live: a list that its own methods work on, and that is written anew after
         a compiled stretch. The function gets it, or a float64 array of the same numbers.
     params : its fixed numbers.
@@ -187,22 +190,3 @@ class ManagedSystem(Protocol):
     def close(self) -> None:
         """Release what the system holds."""
         ...
-
-
-class Bus(Protocol):
-    """Takes records to Knowledge, which appends them, and hands what was appended to the subscribers.
-
-    Records arrive in the order of the log, each once; a handler runs to completion before the next record is
-    delivered, and may send. What a handler raises comes out of `run`, which delivers all that the log held at the call
-    and all that is sent meanwhile through this bus, and returns their number. After `close` nothing is sent or
-    delivered.
-    """
-
-    def subscribe(self, kind: type[Record], handler: Callable[[Any], object]) -> None: ...
-    def send(self, record: Record) -> None: ...
-    def connect(self) -> None: ...
-    def run(self) -> int: ...
-    def close(self) -> None: ...
-
-
-SystemFactory = Callable[[Mapping[str, Any]], ManagedSystem]

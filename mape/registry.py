@@ -7,6 +7,7 @@ import inspect
 import json
 import os
 import sys
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
@@ -70,13 +71,35 @@ def look_here() -> None:
         sys.path.append(os.getcwd())
 
 
+def import_for(named: str, module_name: str) -> ModuleType:
+    """Import the module of what is `named` in messages, from the present folder too.
+
+    Raises
+    ------
+    ConfigError
+        There is no such module, it lacks another one, or it raises.
+    """
+    look_here()
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (module_name == error.name or module_name.startswith(error.name + ".")):
+            raise ConfigError(
+                f"{named}: there is no module {error.name!r} in this folder, {os.getcwd()}, nor on Python's path "
+                "(installed packages, PYTHONPATH)"
+            ) from None
+        raise ConfigError(f"{named} needs the package {error.name!r}, which is not installed") from error
+    except Exception as error:
+        raise ConfigError(f"{named}: its module raised {type(error).__name__}: {error}") from error
+
+
 def find(kind: str, name: str) -> Any:
     """Return the class behind a short name or ``"module:Class"``.
 
     Raises
     ------
-    UnknownName
-        No such short name, module or class.
+    ConfigError
+        No such short name, module or class, or the module cannot be imported.
     """
     entries = PARTS[kind]
     if name in entries:
@@ -88,17 +111,7 @@ def find(kind: str, name: str) -> Any:
     module_name, _, attribute = target.partition(":")
     if not module_name or not attribute:
         raise ConfigError(f'{kind} {name!r} is not of the form "module:Class", such as "my_parts:MyDetector"')
-    look_here()
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and (module_name == error.name or module_name.startswith(error.name + ".")):
-            raise UnknownName(
-                kind, name, entries, f"There is no module {error.name!r} on the path or in this folder."
-            ) from None
-        raise ConfigError(f"{kind} {name!r} needs the package {error.name!r}, which is not installed") from error
-    except Exception as error:
-        raise ConfigError(f"{kind} {name!r}: its module raised {type(error).__name__}: {error}") from error
+    module = import_for(f"{kind} {name!r}", module_name)
     try:
         return getattr(module, attribute)
     except AttributeError:

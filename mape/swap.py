@@ -13,11 +13,10 @@ from mape.config import Config, SwapConfig
 from mape.errors import ConfigError, MapekError, PartError
 from mape.execute import Execute
 from mape.monitor import Monitor
-from mape.parts import PART_OWNER, config_at, make, owner, parts_in, place_of, with_part
+from mape.parts import make, owner, parts_in, place_of, with_part
 from mape.plan import Plan
 from mape.specs import PartSpec
-
-__all__ = ["PART_OWNER", "config_at", "owner", "replace_part", "swap_sentence", "vet", "with_part"]
+from mape.states import FAULTS, told
 
 Component = Monitor | Analyze | Plan | Execute
 
@@ -79,9 +78,9 @@ def replace_part(
         return handed_over
     except MapekError:
         raise
-    except Exception as error:
+    except FAULTS as error:
         raise PartError(
-            f"{spec.name!r} cannot take the place of {part}: {type(error).__name__}: {error}. The old one goes on; run "
+            f"{spec.name!r} cannot take the place of {part}: {told(error)}. The old one goes on; run "
             "`mapek check` on the new one."
         ) from error
 

@@ -1,4 +1,4 @@
-"""`mapek check`: a part, a system, or the system of a config, against the contract of its port."""
+"""`mapek check`: a part with its options, a system, or the system of a config, against the contract of its port."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from adapters.cli.common import config_of, prepare
 from mape import registry, testing
-from mape.config import SystemConfig
+from mape.config import PlannerSpec, SystemConfig
 from mape.errors import ConfigError, UnknownName
-from mape.specs import PartSpec
+from mape.parts import make
+from mape.specs import PartSpec, explain
+from mape.tables import Table, merge, parse_override
 from mape.testing import Finding
 
 # The members by which a class of one's own is told; the first kind that has them all.
@@ -31,10 +35,7 @@ def execute(chosen: argparse.Namespace) -> int:
     if Path(chosen.name).suffix in (".toml", ".json"):
         kind, name, findings = _of_config(chosen)
     else:
-        kind, name = chosen.kind or _kind_of(chosen.name), chosen.name
-        if chosen.profile or chosen.overrides:
-            raise ConfigError(f"--profile and --set are laid over a config; {name!r} is the name of a {kind}")
-        findings = _default_system(name) if kind == "system" else testing.CHECKS[kind](_maker(kind, name))
+        kind, name, findings = _of_name(chosen)
     print(f"{kind} {name}")
     for finding in findings:
         print(f"  {finding}")
@@ -51,30 +52,55 @@ def _of_config(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
     return "system", f"{config.id} of {chosen.name}{played}", _system(config)
 
 
+def _of_name(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
+    kind, name = chosen.kind or _kind_of(chosen.name), chosen.name
+    if chosen.profile or (chosen.overrides and kind == "system"):
+        option = "--profile" if chosen.profile else "--set"
+        raise ConfigError(f"{option} is laid over a config; {name!r} is the name of a {kind}")
+    if kind == "system":
+        return kind, name, _default_system(name)
+    spec = _spec(kind, name, chosen.overrides)
+    options = ", ".join(f"{option} = {value!r}" for option, value in spec.options.items())
+    return kind, f"{name} ({options})" if options else name, testing.CHECKS[kind](_maker(kind, spec))
+
+
+def _spec(kind: str, name: str, overrides: list[str]) -> PartSpec:
+    """Return a part as a config would have it, with what --set says as its options."""
+    table: Table = {}
+    for override in overrides:
+        table = merge(table, parse_override(override))
+    model = PlannerSpec if kind == "planner" else PartSpec
+    try:
+        return model.model_validate({**table, "name": name})
+    except ValidationError as error:
+        raise ConfigError(explain(error, f"{kind}.", model)) from None
+
+
 def _kind_of(name: str) -> str:
     kinds = [kind for kind, parts in registry.PARTS.items() if name in parts]
     if len(kinds) > 1:
         raise ConfigError(f"{name!r} is a {' and a '.join(kinds)}; say which with --kind")
     if kinds:
         return kinds[0]
-    _, _, attribute = name.partition(":")
-    if not attribute or "/" in name:
-        from adapters.systems.checking import is_registered
+    from adapters.systems.checking import is_registered
 
+    module, _, attribute = name.partition(":")
+    if not attribute or "/" in module:
         if is_registered(name):
             return "system"
         known = {part for parts in registry.PARTS.values() for part in parts}
         raise UnknownName(
             "part or system", name, known, 'A part of your own is "module:Class", a system a Gymnasium id.'
         )
-    registry.look_here()
-    if _registers(name):
+    if module:
+        registry.import_for(f"part or system {name!r}", module)  # which registers its environments
+    if is_registered(attribute):
         return "system"
     part = registry.find("detector", name)
     if inspect.isclass(part) and any(base.__module__.startswith("gymnasium.") for base in part.__mro__):
         raise ConfigError(
             f"{name!r} is a Gymnasium environment: have its module register it, and check it under its id, "
-            f"{name.partition(':')[0]}:NAME-v0"
+            f"{module}:NAME-v0"
         )
     if inspect.isclass(part):
         for kind, members in _MEMBERS.items():
@@ -87,27 +113,14 @@ def _kind_of(name: str) -> str:
     )
 
 
-def _registers(name: str) -> bool:
-    """Whether a module, once imported, registers the environment that is named behind the colon."""
-    import importlib
-
-    from adapters.systems.checking import is_registered
-
-    module, _, identifier = name.partition(":")
+def _maker(kind: str, spec: PartSpec) -> Callable[[], Any]:
     try:
-        importlib.import_module(module)
-    except Exception:  # what is wrong with it is said where the part is looked for
-        return False
-    return is_registered(identifier)
-
-
-def _maker(kind: str, name: str) -> Callable[[], Any]:
-    def make() -> Any:
-        schedule = registry.build("schedule", PartSpec(name="exponential"))
-        return registry.build(kind, PartSpec(name=name), **({"schedule": schedule} if kind == "planner" else {}))
-
-    make()  # what is wrong with the options is the user's to know, not a broken contract
-    return make
+        make(kind, spec)  # what is wrong with the options is the user's to know, not a broken contract
+    except ConfigError as error:
+        if spec.options or not isinstance(error.__cause__, TypeError):
+            raise
+        raise ConfigError(f"{error}; give its options with --set KEY=VALUE") from error
+    return lambda: make(kind, spec)
 
 
 def _default_system(name: str) -> list[Finding]:

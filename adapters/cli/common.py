@@ -7,6 +7,7 @@ import atexit
 import contextlib
 import gc
 import json
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -14,13 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from adapters import detectors
+from adapters.cli.main import OutputError
 from adapters.experiments.runner import announce_compilation, check
 from adapters.experiments.statistics import finite
 from adapters.results import RunFolder
-from adapters.results.files import cannot_write, write_json
+from adapters.results.files import cannot_write, try_whole, write_json
 from adapters.results.folder import default_path
 from mape.config import Config, load
-from mape.errors import ConfigError
+from mape.errors import ConfigError, ResultsError
+from mape.tables import parse_override
 
 
 def prepare() -> None:
@@ -37,9 +40,11 @@ def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = 
     `defaults` fill what the command line leaves open.
     """
     overrides = list(chosen.overrides)
+    given = {key for override in overrides for key in parse_override(override)}
     for key in ("seed", "trials"):
         value = getattr(chosen, key, None)
-        value = defaults.get(key) if value is None else value
+        if value is None and key not in given:
+            value = defaults.get(key)
         if value is not None:
             overrides.append(f"{key}={value}")
     if (engine := getattr(chosen, "engine", None)) is not None:
@@ -60,7 +65,7 @@ def open_folder(
     What is wrong with a config is said before: no folder is begun that could not be gone on with.
     """
     check_json_target(chosen)
-    if chosen.out and Path(chosen.out).exists() and not Path(chosen.out).is_dir():
+    if chosen.out and os.path.exists(chosen.out) and not os.path.isdir(chosen.out):
         raise ConfigError(f"--out {chosen.out!r} is a file; name a folder, which may be new")
     for agent, config in configs.items():
         check_name(agent)
@@ -116,15 +121,36 @@ def check_json_target(chosen: argparse.Namespace) -> None:
     if chosen.json in (None, "-"):
         return
     path = Path(chosen.json)
-    if path.is_dir():
+    if os.path.isdir(path):
         raise ConfigError(f"--json {chosen.json!r} is a folder; name a file, or - for standard output")
-    if not path.absolute().parent.is_dir():
+    if not os.path.isdir(path.absolute().parent):
         raise ConfigError(f"--json {chosen.json!r}: there is no folder {str(path.parent)!r} to hold it; make it first")
+    if _is_replaced(path):
+        try:
+            try_whole(path, "Nothing was run; choose another place for --json.")
+        except ResultsError as error:
+            raise ConfigError(f"--json {chosen.json!r}: {error}") from error
+    elif not os.access(path, os.W_OK):
+        raise ConfigError(f"--json {chosen.json!r} may not be written by you; choose another place")
+
+
+def _is_replaced(path: Path) -> bool:
+    """Whether a file is written anew and put in its place: a device or a pipe cannot be replaced."""
+    return os.path.isfile(path) or not os.path.exists(path)
 
 
 def say(chosen: argparse.Namespace, text: str = "") -> None:
-    """Print for people: on standard error where standard output carries JSON."""
-    print(text, file=sys.stderr if chosen.json == "-" else sys.stdout)
+    """Print for people: on standard error where standard output carries JSON.
+
+    Raises
+    ------
+    OutputError
+        It cannot be printed.
+    """
+    try:
+        print(text, file=sys.stderr if chosen.json == "-" else sys.stdout)
+    except OSError as error:
+        raise OutputError(error) from error
 
 
 def finish(chosen: argparse.Namespace, folder: RunFolder, result: Mapping[str, Any], figures: list[Path]) -> None:
@@ -135,16 +161,17 @@ def finish(chosen: argparse.Namespace, folder: RunFolder, result: Mapping[str, A
         print(json.dumps(result, indent=2, allow_nan=False))
     elif chosen.json:
         target = Path(chosen.json)
-        if target.exists() and not target.is_file():  # a device or a pipe cannot be replaced
+        if _is_replaced(target):
+            write_json(target, result, folder.kept())
+        else:
             try:
                 with open(target, "w", encoding="utf-8") as file:
                     json.dump(result, file, indent=2, allow_nan=False)
             except OSError as error:
-                raise cannot_write(target, error, f"The run is complete; all of it is in {folder.path}.") from error
-        else:
-            write_json(target, result)
+                raise cannot_write(target, error, folder.kept()) from error
     if figures:
         say(
             chosen, f"figures:  {folder.path / 'figures'} ({', '.join(sorted({p.stem for p in figures}))}; PNG and PDF)"
         )
     say(chosen, f"results:  {folder.path}")
+    sys.stdout.flush()  # here, where it can still be said what the folder holds

@@ -1,4 +1,4 @@
-"""The command line: what can be said, and what becomes of errors.
+"""The command line: the command that was typed is run, and what becomes of errors.
 
 Exit codes: 0 done; 1 failure; 2 usage, a config among it; 130 after Ctrl-C, 143 after SIGTERM, with what is finished
 kept.
@@ -12,214 +12,20 @@ import os
 import sys
 from collections.abc import Sequence
 
+from adapters.cli.options import parser
+
 # Nothing else is imported here: `mapek --help` must answer at once.
 
-DESCRIPTION = "Self-adaptive systems as an explicit Monitor - Analyze - Plan - Execute loop over shared Knowledge."
-EPILOG = """\
-examples:
-  mapek reproduce table1                                    the paper's Table 1, 1,000 trials, both agents
-  mapek run examples/frozen_lake.toml --seed 7              one run of any Gymnasium environment
-  mapek run examples/gridworld_goals.toml --show 298:305    what each part says, pass by pass
-  mapek compare examples/gridworld_goals.toml --trials 50   all agents of a config on the same seeds
-  mapek run examples/traffic.toml --set 'monitor.detectors=["two_window"]'
-  mapek up examples/gridworld_goals.toml                    the same loop as five processes
 
-exit codes: 0 done, 1 failure, 2 usage, 130 stopped by Ctrl-C (finished trials are kept), 143 by SIGTERM
-"""
+class OutputError(Exception):
+    """What was said to the user could not be written; `reason` is the OSError.
 
+    It is none itself: while trials run, those are of the files of results.
+    """
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> None:  # type: ignore[override]
-        self.exit(2, f"{self.prog}: {message}\nSee `{self.prog} --help`.\n")
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the whole command line."""
-    top = _Parser(
-        prog="mapek", description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    top.add_argument("--version", action="store_true", help="print versions and leave")
-    commands = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
-
-    run = commands.add_parser("run", help="run a config; results go into a folder", description="Run a config.")
-    run.add_argument("config", metavar="CONFIG", help="TOML file, or the config-*.json of an earlier run")
-    run.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
-    _what_runs(run)
-    _where_to(run)
-    run.add_argument(
-        "--show", type=_span, metavar="FROM:TO", help="print the four records of these passes as sentences"
-    )
-    run.add_argument("--trace", type=_span, metavar="FROM:TO", help="keep every step of these episodes of trial 0")
-
-    compare = commands.add_parser(
-        "compare",
-        help="several configs, or all agents of one, on the same seeds",
-        description="Run configs on the same seeds: one table, with effect sizes, intervals and tests.",
-    )
-    compare.add_argument(
-        "configs", nargs="+", metavar="CONFIG", help="config files; one alone is compared over its agents"
-    )
-    compare.add_argument("--agents", metavar="A,B", help="of the configs' agents, only these")
-    _what_runs(compare)
-    _where_to(compare)
-
-    reproduce = commands.add_parser(
-        "reproduce",
-        help="the paper's experiments, table1 beside the paper's numbers",
-        description="Reproduce an experiment of arXiv 2601.20714: table1 beside the paper's numbers, jump and traffic "
-        "beside numbers found before.",
-    )
-    reproduce.add_argument(
-        "experiment", choices=["table1", "jump", "traffic"],
-        help="goals that swap corners; jumps that become possible; a junction whose traffic shifts",
-    )  # fmt: skip
-    _what_runs(reproduce)
-    _where_to(reproduce)
-    reproduce.add_argument(
-        "--no-statistics", action="store_true",
-        help="leave the tables of results out; with --no-figures too, only run, store and hash",
-    )  # fmt: skip
-
-    step = commands.add_parser(
-        "step", help="advance record by record on Enter", description="Step through a run, record by record."
-    )
-    step.add_argument("config", metavar="CONFIG")
-    step.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
-    _overlays(step)
-    step.add_argument(
-        "--from", dest="first", type=_positive, default=1, metavar="PASS", help="run up to this pass first"
-    )
-
-    up = commands.add_parser(
-        "up",
-        help="run a config as five processes, watched and restarted",
-        description="Run a config as five processes on this machine: Knowledge, Monitor, Analyze, Plan, Execute. They "
-        "are watched, and started again when they die; what comes out is what `mapek run` gives, bit for bit.",
-    )
-    up.add_argument("config", metavar="CONFIG", help="TOML file, or the config-*.json of an earlier run")
-    up.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
-    _overlays(up)
-    up.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions, side by side")
-    up.add_argument("--listen", metavar="ENDPOINT", help="where they meet (default: a socket in a temporary folder)")
-    _where_to(up)
-    _keeps(up)
-    up.add_argument(
-        "--hang-after", type=_seconds, default=60.0, metavar="S",
-        help="restart a process that is alive and silent for so long; longer than an episode takes (default 60)",
-    )  # fmt: skip
-    _secure(up)
-
-    serve = commands.add_parser(
-        "serve",
-        help="one process of a run, here or on another machine",
-        description="Be one process of a run. Start the five in any order, on as many machines as you like.",
-    )
-    serve.add_argument("config", metavar="CONFIG", help="the same file and options for all processes")
-    serve.add_argument("--role", required=True, choices=["knowledge", "monitor", "analyze", "plan", "execute"])
-    serve.add_argument("--listen", metavar="ENDPOINT", help="knowledge: such as tcp/127.0.0.1:7447")
-    serve.add_argument("--connect", metavar="ENDPOINT", help="the others: where Knowledge listens")
-    serve.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
-    _overlays(serve)
-    serve.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions, side by side")
-    _where_to(serve)
-    _keeps(serve)
-    _secure(serve)
-    serve.add_argument("--log", metavar="FILE", help=argparse.SUPPRESS)
-    serve.add_argument("--leash", action="store_true", help=argparse.SUPPRESS)
-
-    status = commands.add_parser("status", help="who is there, and how far a run is", description="Look at a run.")
-    status.add_argument("--connect", required=True, metavar="ENDPOINT", help="where Knowledge listens")
-    status.add_argument("--json", action="store_true", help="as JSON")
-    _secure(status)
-
-    swap = commands.add_parser(
-        "swap",
-        help="replace a part of a running loop",
-        description="Replace a part of a running loop at the boundary of a pass. What does not keep the contract of "
-        "its kind, or fails at its first pass, is refused, and the old part goes on.",
-    )
-    swap.add_argument("part", metavar="PART", help="monitor, monitor.K, analyze, plan, plan.schedule or learner")
-    swap.add_argument(
-        "to", metavar="TO", help="short name, module:Class, or a table such as '{name = \"morphin\", alpha = 0.2}'"
-    )
-    swap.add_argument("--connect", required=True, metavar="ENDPOINT", help="where Knowledge listens")
-    _secure(swap)
-
-    log = commands.add_parser(
-        "log",
-        help="the records of a run, from its folder",
-        description="Print the records that a run of `mapek up` or `mapek serve` has logged, finished or not.",
-    )
-    log.add_argument("folder", metavar="DIR", help="folder of the run, or its log.sqlite")
-    log.add_argument("--pass", dest="passes", type=_span, metavar="N|FROM:TO", help="only these passes")
-    log.add_argument("--stage", choices=["observation", "symptom", "request", "plan"], help="only this kind of record")
-    log.add_argument("--loop", type=_natural, metavar="L", help="only this loop, by its number in the records")
-    log.add_argument("--events", action="store_true", help="what happened beside the records too: who joined, ...")
-    log.add_argument("--follow", action="store_true", help="go on until the run is complete, or Ctrl-C")
-    log.add_argument("--json", action="store_true", help="JSON lines: each record as it stands in the log")
-
-    replay = commands.add_parser(
-        "replay",
-        help="derive a run again and compare it with what is on disk",
-        description="Derive each record of a log again (`mapek up`, `mapek serve`), or run the trials of a folder of "
-        "tables again (`mapek run`, `compare`, `reproduce`), and name the first difference.",
-    )
-    replay.add_argument("folder", metavar="DIR", help="folder of the run, or its log.sqlite")
-    replay.add_argument(
-        "--to", type=_positive, metavar="PASS", help="stop after this pass, and show what Knowledge then held"
-    )
-    replay.add_argument("--loop", type=_natural, metavar="L", help="only this loop, by its number in the records")
-    replay.add_argument("--json", action="store_true", help="as JSON; with --to the whole Q-table is in it")
-    _how(replay)
-
-    resume = commands.add_parser(
-        "resume",
-        help="continue an unfinished run, whatever command began it",
-        description="Continue an unfinished run by the command that began it, in the folder where it was given.",
-    )
-    resume.add_argument("folder", metavar="DIR", help="folder of the run")
-    _how(resume)
-
-    keys = commands.add_parser(
-        "keys",
-        help="make a private CA and the certificates of all roles",
-        description="Make a private certificate authority and one certificate per role, for --tls DIR.",
-    )
-    keys.add_argument("folder", metavar="DIR")
-    keys.add_argument(
-        "--host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="name or address of Knowledge's machine (repeatable)",
-    )
-    keys.add_argument("--days", type=_positive, default=365, metavar="N", help="validity (default 365)")
-    keys.add_argument("--renew", metavar="ROLE", help="make this role's certificate anew, with the CA that is there")
-
-    schema = commands.add_parser(
-        "schema",
-        help="the wire as an AsyncAPI document: every key expression and message",
-        description="Print the AsyncAPI 3.0 document of the wire, generated from the code.",
-    )
-    schema.add_argument("--out", metavar="FILE", help="write it there instead")
-
-    commands.add_parser("list", help="systems, detectors, planners, schedules, learners: one line each")
-
-    check = commands.add_parser(
-        "check",
-        help="hold a part or system against its contract",
-        description="Check that a part or a system keeps the contract of its port.",
-    )
-    check.add_argument(
-        "name", metavar="NAME|module:Class|CONFIG",
-        help="short name, Gymnasium id, a part of your own, or a config, of which the system is checked",
-    )  # fmt: skip
-    _overlays(check, seed=False)
-    check.add_argument(
-        "--kind", choices=["detector", "analyzer", "planner", "schedule", "learner", "system"],
-        help="what it is to be (default: told by its name or its members)",
-    )  # fmt: skip
-    return top
+    def __init__(self, reason: OSError) -> None:
+        super().__init__(str(reason))
+        self.reason = reason
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -243,20 +49,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = dispatch(chosen)
         sys.stdout.flush()  # here, where what goes wrong can still be said
         return code
-    except KeyboardInterrupt:
-        print("mapek: stopped.", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"mapek: stopped.{_notes(stop)}", file=sys.stderr)
         return 130
-    except BrokenPipeError:
-        # The reader has gone (`mapek list | head`); Python would complain once more when it flushes at exit.
-        _silence()
-        return 1
     except Exception as error:
         return _failed(error)
 
 
-def _silence() -> None:
-    # What is still in the buffer would be tried once more at exit.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def _notes(error: BaseException) -> str:
+    """Return what was noted of a run on the way, a blank before each sentence."""
+    return "".join(f" {note}" for note in getattr(error, "__notes__", ()))
 
 
 def dispatch(chosen: argparse.Namespace) -> int:
@@ -291,10 +93,15 @@ def _shadowed() -> str | None:
 def _failed(error: Exception) -> int:
     from mape.errors import ConfigError, MapekError
 
-    if isinstance(error, OSError) and error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EIO):
-        # Files of ours are written elsewhere, and named; what is left is standard output.
-        print(f"mapek: standard output cannot be written: {error.strerror}. Lead it to another place.", file=sys.stderr)
-        _silence()
+    if (reason := _of_output(error)) is not None:
+        # What is still in the buffer would be tried once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        notes = _notes(error)
+        if not isinstance(reason, BrokenPipeError):
+            said = f"standard output cannot be written: {reason.strerror}. Lead it to another place.{notes}"
+            print(f"mapek: {said}", file=sys.stderr)
+        elif notes:  # else the reader has seen enough, as of `mapek list | head`
+            print(f"mapek: nobody reads standard output any more.{notes}", file=sys.stderr)
         return 1
     if not isinstance(error, MapekError):
         raise error
@@ -304,96 +111,14 @@ def _failed(error: Exception) -> int:
     return 2 if isinstance(error, ConfigError) else 1
 
 
-def _overlays(command: argparse.ArgumentParser, *, seed: bool = True) -> None:
-    command.add_argument("--profile", metavar="NAME", help="lay the config's [profiles.NAME] over it")
-    command.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
-        help="override, such as plan.alpha=0.2; VALUE is TOML (repeatable)",
-    )  # fmt: skip
-    if seed:
-        command.add_argument("--seed", type=_natural, metavar="N", help="root of all randomness")
-
-
-def _what_runs(command: argparse.ArgumentParser) -> None:
-    _overlays(command)
-    command.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions")
-    command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one per core)")
-    command.add_argument(
-        "--engine", choices=["auto", "python", "compiled"],
-        help="compile what can be (auto), nothing, or everything; the bits are the same",
-    )  # fmt: skip
-    command.add_argument("-v", "--verbose", action="store_true", help="say of each agent what is compiled, and why")
-
-
-def _how(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one per core)")
-    command.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
-
-
-def _where_to(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--out", metavar="DIR", help="new folder, or that of an unfinished run to be continued")
-    command.add_argument("--json", metavar="FILE", help="write the result as JSON too; - for standard output")
-    command.add_argument("--no-figures", action="store_true", help="leave the figures out")
-    command.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
-
-
-def _keeps(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--durability", choices=["normal", "full"], default="normal",
-        help="what is acknowledged outlives the process (normal), or a loss of power too (full, slower)",
-    )  # fmt: skip
-    command.add_argument(
-        "--snapshot-every",
-        type=_positive,
-        default=100,
-        metavar="N",
-        help="passes between two kept states (default 100)",
-    )
-
-
-def _secure(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--tls", metavar="DIR", help="keys as `mapek keys DIR` makes them: everybody proves who they are"
-    )
-    command.add_argument(
-        "--insecure", action="store_true", help="allow other machines without keys, where the network is trusted"
-    )
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 0.1 <= seconds < 1e9:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds of at least 0.1")
-    return seconds
-
-
-def _positive(text: str) -> int:
-    return _whole(text, 1)
-
-
-def _natural(text: str) -> int:
-    return _whole(text, 0)
-
-
-def _whole(text: str, least: int) -> int:
-    try:
-        number = int(text)
-    except ValueError:
-        number = least - 1
-    if number < least:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
-    return number
-
-
-def _span(text: str) -> tuple[int, int]:
-    first, _, last = text.partition(":")
-    try:
-        span = int(first), int(last or first)
-    except ValueError:
-        span = 0, 0
-    if not 1 <= span[0] <= span[1]:
-        raise argparse.ArgumentTypeError(f"{text!r} is not FROM:TO with 1 <= FROM <= TO, such as 298:305")
-    return span
+def _of_output(error: Exception) -> OSError | None:
+    """Return what standard output raised, or None where the error is another one."""
+    if isinstance(error, OutputError):
+        return error.reason
+    # Files of ours are written elsewhere, and named; what is left is standard output.
+    full = (errno.ENOSPC, errno.EFBIG, errno.EIO)
+    if isinstance(error, BrokenPipeError) or (
+        isinstance(error, OSError) and not error.filename and error.errno in full
+    ):
+        return error
+    return None

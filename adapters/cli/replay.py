@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from adapters.cli.common import prepare
-from adapters.cli.sentences import sentence
+from adapters.cli.sentences import ids, sentence
 from adapters.replay.records import Difference, LogReplay, Moment, Replayed, as_json, log_of
 from adapters.replay.tables import replay_tables
 from adapters.results.files import read_json
@@ -174,7 +174,7 @@ def _print_moment(moment: Moment, named: bool) -> None:
     print(f"--- {of}after pass {seen.pass_no}")
     print(f"signals:     {', '.join(f'{name} {value:.6g}' for name, value in seen.signals.items())}")
     print(f"plan:        {sentence(moment.plan).split(maxsplit=1)[1]}")
-    print(f"actions:     available {_ids(seen.available)}, in the Q-table {_ids(moment.known)}")
+    print(f"actions:     available {ids(seen.available)}, in the Q-table {ids(moment.known)}")
     for place, detector in enumerate(moment.detectors):
         print(f"detector {place}:  {detector['name']} on {detector['signal']}, {_state(detector['state'])}")
     print(f"analyzer:    {moment.analyzer['name']}, {_state(moment.analyzer['state'])}")
@@ -187,10 +187,6 @@ def _print_moment(moment: Moment, named: bool) -> None:
     print(f"Q-table:     {rows} actions x {states} states, largest value {table['max']:.6g}, {table['sha256']}")
     for action, most in zip(table["actions"], table["row_max"], strict=True):
         print(f"  action {action:<3} largest value {most:.6g}")
-
-
-def _ids(actions: tuple[int, ...]) -> str:
-    return "{" + ", ".join(map(str, actions)) + "}"
 
 
 def _state(state: Any) -> str:

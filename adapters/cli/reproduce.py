@@ -18,9 +18,10 @@ from adapters.experiments.metrics import (
     detection,
     greedy_length,
     recovery,
+    shortest_path,
     trailing_mean,
 )
-from adapters.experiments.runner import experiment_config, run_agents
+from adapters.experiments.runner import drifts_of, experiment_config, run_agents
 from adapters.experiments.statistics import Comparison, compare, summary
 from adapters.results import RunFolder
 from adapters.systems import make_system
@@ -75,12 +76,6 @@ def _steps(chosen: argparse.Namespace, results: Results) -> dict[str, Any]:
     return {"agents": {agent: {"steps": total} for agent, total in steps.items()}}
 
 
-def _drifts(config: Config) -> tuple[int, ...]:
-    system = make_system(config.system)
-    system.close()
-    return system.drifts
-
-
 def _alarms(results: list[TrialResult]) -> list[tuple[int, ...]]:
     return [r.alarms for r in results]
 
@@ -91,7 +86,7 @@ def _alarms(results: list[TrialResult]) -> list[tuple[int, ...]]:
 def _table1(
     chosen: argparse.Namespace, folder: RunFolder, configs: Mapping[str, Config], results: Results
 ) -> dict[str, Any]:
-    drifts = _drifts(configs["morphin"])
+    drifts = drifts_of(configs["morphin"])
     totals = {agent: np.array([r.total_steps for r in found], dtype=float) for agent, found in results.items()}
     by_stage, recovered = {}, {}
     for agent in configs:
@@ -117,7 +112,7 @@ def _table1(
     say(chosen, "\nDetection (Page-Hinkley on the return, MORPHIN)")
     say(chosen, f"{'drift after episode':<23}{'recall':>10}{'mean delay':>14}{'false alarms/trial':>22}")
     say(chosen, f"{'(before the first)':<23}{'':>10}{'':>14}{initial:>22.3f}")
-    for drift, found in zip(drifts, met, strict=False):
+    for drift, found in zip(drifts, met, strict=True):
         _detection_line(chosen, drift, found)
     say(chosen, _DELAY)
     if profile == "paper":
@@ -216,8 +211,18 @@ def _detection_line(chosen: argparse.Namespace, drift: int, found: Detection) ->
     say(chosen, f"{drift - 1:<23}{found.recall:>10.3f}{delay:>14}{found.false_alarms:>22.3f}")
 
 
-_BEFORE = "\nbefore: found earlier with these settings, over 100 to 1,000 trials."
 _DELAY = "delay: episodes of the new regime until the alarm, the alarm's own included"
+
+
+def _as_it_comes(chosen: argparse.Namespace) -> bool:
+    return not chosen.overrides and chosen.profile is None
+
+
+def _before(chosen: argparse.Namespace) -> str:
+    found = "before: found earlier with these settings, over 100 to 1,000 trials."
+    if _as_it_comes(chosen):
+        return found
+    return found.replace("these settings", "the experiment's own settings, not these")
 
 
 def _sd(values: npt.NDArray[Any]) -> float | None:
@@ -231,7 +236,7 @@ def _traffic(
     chosen: argparse.Namespace, folder: RunFolder, configs: Mapping[str, Config], results: Results
 ) -> dict[str, Any]:
     episodes = configs["morphin"].episodes
-    drifts = tuple(d for d in _drifts(configs["morphin"]) if d <= episodes)
+    drifts = drifts_of(configs["morphin"])
     points = [e for e in paper.TRAFFIC_EPISODES if e <= episodes] or [episodes]
     say(chosen, f"Traffic, {configs['morphin'].trials:,} trials per agent: mean return of the last 500 episodes")
     say(chosen, f"\n{'at episode':<30}" + "".join(f"{e:>9}" for e in points))
@@ -243,7 +248,7 @@ def _traffic(
         if all(c.interval is not None for c in curve):
             say(chosen, f"{'':<22}{'± 95 %':<8}" + "".join(f"{_half(c.interval):>9.1f}" for c in curve))
         by_episode = dict(zip(paper.TRAFFIC_EPISODES, paper.TRAFFIC[agent], strict=True))
-        say(chosen, f"{'':<22}{'before':<8}" + "".join(f"{by_episode.get(e, float('nan')):>9}" for e in points))
+        say(chosen, f"{'':<22}{'before':<8}" + "".join(f"{by_episode.get(e, '-'):>9}" for e in points))
         met, initial = detection(_alarms(results[agent]), drifts, config.episodes, window=500)
         found[agent] = {
             "curve": {str(e): c.mean for e, c in zip(points, curve, strict=True)},
@@ -258,8 +263,8 @@ def _traffic(
             for drift, one in zip(drifts, found[agent]["detection"], strict=True):
                 _detection_line(chosen, drift, Detection(**one))
     say(chosen, _DELAY)
-    say(chosen, _BEFORE)
-    if not chosen.overrides:
+    say(chosen, f"\n{_before(chosen)}")
+    if _as_it_comes(chosen):
         say(
             chosen,
             "Drift 2 raises the reward, and a test for falls does not see it. At these settings Q-learning that is "
@@ -302,34 +307,13 @@ def _jump(
         found[agent] = {"steps_before": means[0], "steps_after": means[1], "optimal_share": share}
     system.close()
     say(chosen, "\noptimal: share of trials whose greedy path at the end is a shortest one.")
-    say(chosen, f"{_BEFORE.strip()} The paper does not publish its layout; this one is ours.")
+    say(chosen, f"{_before(chosen)}\nThe paper does not publish its layout; this one is ours.")
     return {"agents": found, "shortest_path": optimum}
 
 
 def _mean_over(steps: npt.NDArray[Any], first: int, last: int) -> float | None:
     """Return the mean over episodes `first` to `last`; None where the run is shorter."""
     return float(steps[:, first - 1 : last].mean()) if last <= steps.shape[1] else None
-
-
-def shortest_path(system: Any, episode: int) -> int | None:
-    """Return the number of steps of a shortest path to a terminal state, by breadth-first search over the rules."""
-    rules = system.rules
-    draws = np.zeros(rules.reset_draws + rules.step_draws + 1)
-    context = np.zeros(len(rules.signal_names))
-    phase = rules.phase(rules.params, episode)
-    frontier = {rules.reset(rules.params, phase, draws, 0)}
-    seen = set(frontier)
-    for length in range(1, system.n_states + 1):
-        reached = set()
-        for state in frontier:
-            for action in system.available(episode) or ():
-                following, _, terminated = rules.step(rules.params, phase, state, action, draws, 0, context)
-                if terminated:
-                    return length
-                reached.add(following)
-        frontier = reached - seen
-        seen |= frontier
-    return None
 
 
 Kind = Callable[[argparse.Namespace, RunFolder, Mapping[str, Config], Results], dict[str, Any]]

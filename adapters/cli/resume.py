@@ -10,7 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from adapters.cli.main import dispatch, parser
+from adapters.cli.main import dispatch
+from adapters.cli.options import parser
 from adapters.results.folder import read_manifest
 from mape.errors import ConfigError, ResultsError
 

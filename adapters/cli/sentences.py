@@ -30,7 +30,7 @@ def _observation(seen: Observation) -> str:
     if own:
         text += f"; {', '.join(own)}"
     if seen.available != seen.known:
-        text += f"; available actions {_ids(seen.available)}, in the Q-table {_ids(seen.known)}"
+        text += f"; available actions {ids(seen.available)}, in the Q-table {ids(seen.known)}"
     return text + "."
 
 
@@ -50,9 +50,9 @@ def _request(request: ChangeRequest) -> str:
         for drift in request.drifts
     ]
     if request.added:
-        parts.append(f"new actions {_ids(request.added)}")
+        parts.append(f"new actions {ids(request.added)}")
     if request.removed:
-        parts.append(f"vanished actions {_ids(request.removed)}")
+        parts.append(f"vanished actions {ids(request.removed)}")
     return ("; ".join(parts) or "nothing changed") + "."
 
 
@@ -60,11 +60,11 @@ def _plan(plan: ChangePlan) -> str:
     rate = ", ".join(f"{value:g}" for value in plan.learning_rate)
     parts = [f"plan {plan.pass_no}: epsilon {plan.epsilon:.3f}, learning rate ({rate})"]
     if plan.add:
-        parts.append(f"add rows for actions {_ids(plan.add)}")
+        parts.append(f"add rows for actions {ids(plan.add)}")
     if plan.drop:
-        parts.append(f"drop the rows of actions {_ids(plan.drop)}")
+        parts.append(f"drop the rows of actions {ids(plan.drop)}")
     if plan.enable:
-        parts.append(f"enable actions {_ids(plan.enable)}")
+        parts.append(f"enable actions {ids(plan.enable)}")
     if plan.reset_detector:
         parts.append("reset the detectors")
     if plan.adopt:
@@ -72,5 +72,10 @@ def _plan(plan: ChangePlan) -> str:
     return "; ".join(parts) + "."
 
 
-def _ids(actions: tuple[int, ...]) -> str:
+def ids(actions: tuple[int, ...]) -> str:
+    """Write a set of actions.
+
+    >>> ids((0, 3))
+    '{0, 3}'
+    """
     return "{" + ", ".join(map(str, actions)) + "}"

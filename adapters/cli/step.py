@@ -42,8 +42,8 @@ def execute(chosen: argparse.Namespace) -> int:
                 print("--- start")
             print(sentence(record))
         # The last plan drives no episode, but is a record of its pass.
-        while (record := loop.bus.deliver()) is not None:
-            print(sentence(record))
+        while (left := loop.bus.deliver()) is not None:
+            print(sentence(left))
         print(f"the run ends after {config.episodes} passes. log {loop.log.sha256()}")
     finally:
         loop.system.close()

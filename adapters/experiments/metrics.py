@@ -1,8 +1,11 @@
-"""Measures of a run: convergence per stage, detection of drifts, trailing means. All over arrays (trials, episodes)."""
+"""Measures of a run: convergence per stage, detection of drifts, trailing means; lengths of paths.
+
+All but the last are over arrays (trials, episodes).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -170,16 +173,55 @@ def greedy_length(
     Number of steps to a terminal state, or None where the policy runs in a circle.
     """
     rows = [row for row, action in enumerate(actions) if action in available]
-    # Deterministic systems ignore their uniforms.
-    draws = np.zeros(rules.reset_draws + rules.step_draws + 1)
-    context = np.zeros(len(rules.signal_names))
-    phase = rules.phase(rules.params, episode)
-    state = rules.reset(rules.params, phase, draws, 0)
+    state, move = _walk(rules, episode)
     seen: set[int] = set()
     while state not in seen:
         seen.add(state)
         row = rows[int(np.argmax(values[rows, state]))]
-        state, _, terminated = rules.step(rules.params, phase, state, actions[row], draws, 0, context)
+        state, terminated = move(state, actions[row])
         if terminated:
             return len(seen)
     return None
+
+
+def shortest_path(system: Any, episode: int) -> int | None:
+    """Find a shortest path to a terminal state by breadth-first search over a deterministic system's rules.
+
+    Parameters
+    ----------
+    system
+        As `mape.ports.ManagedSystem`, with rules.
+    episode
+        Whose regime and actions hold.
+
+    Returns
+    -------
+    Number of its steps, or None where no path leads there.
+    """
+    start, move = _walk(system.rules, episode)
+    frontier = {start}
+    seen = set(frontier)
+    for length in range(1, system.n_states + 1):
+        reached = set()
+        for state in frontier:
+            for action in system.available(episode) or ():
+                following, terminated = move(state, action)
+                if terminated:
+                    return length
+                reached.add(following)
+        frontier = reached - seen
+        seen |= frontier
+    return None
+
+
+def _walk(rules: Any, episode: int) -> tuple[int, Callable[[int, int], tuple[int, bool]]]:
+    """Return the first state of an episode, and where an action leads from a state, and whether that is the end."""
+    draws = np.zeros(rules.reset_draws + rules.step_draws + 1)  # deterministic systems ignore their uniforms
+    context = np.zeros(len(rules.signal_names))
+    phase = rules.phase(rules.params, episode)
+
+    def move(state: int, action: int) -> tuple[int, bool]:
+        following, _, terminated = rules.step(rules.params, phase, state, action, draws, 0, context)
+        return following, terminated
+
+    return rules.reset(rules.params, phase, draws, 0), move

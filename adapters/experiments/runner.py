@@ -144,13 +144,7 @@ def run_agents(
                 for agent in configs:
                     folder.assemble(agent)
         except KeyboardInterrupt:
-            kept = sum(len(folder.finished(agent)) for agent in configs)
-            wanted = sum(config.units for config in configs.values())
-            units = "trials" if all(config.loops == 1 for config in configs.values()) else "loops of trials"
-            raise Stopped(
-                f"stopped. {kept:,} of {wanted:,} {units} are finished and kept in {folder.path}; "
-                f"`mapek resume {folder.path}` continues."
-            ) from None
+            raise Stopped(f"stopped. {folder.kept()}") from None
     results = {agent: folder.finished(agent) for agent in configs}
     return {agent: [found[unit] for unit in sorted(found)] for agent, found in results.items()}
 
@@ -280,6 +274,13 @@ def announce_compilation() -> None:
     """Say on standard error when something is compiled that is not in the cache."""
     if not compose.on_compile:
         compose.on_compile.append(lambda sentence: print(sentence, file=sys.stderr))  # noqa: T201
+
+
+def drifts_of(config: Config) -> tuple[int, ...]:
+    """Return the episodes of a run of `config` from which a new regime holds, where its system knows them."""
+    system = make_system(config.system)
+    system.close()
+    return tuple(drift for drift in system.drifts if drift <= config.episodes)
 
 
 def experiment_config(name: str) -> Path:

@@ -23,16 +23,23 @@ NotImplementedError is zipfile's word for a damaged entry that seems to ask for 
 """
 
 
+GO_ON = (
+    "What was finished before is kept; make room or choose another place, and give the same command with the same "
+    "--out to go on."
+)
+
+
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[IO[bytes]]:
+def whole(path: Path, way_out: str = GO_ON) -> Iterator[IO[bytes]]:
     """Open a file that takes its name only when all of it is written.
 
     Raises
     ------
     ResultsError
-        The disk is full, or the folder cannot be written; nothing of the file stays.
+        The disk is full, or the folder cannot be written; nothing of the file stays. An OSError of what is done
+        meanwhile counts as the file's: who does something else, such as printing, raises another error.
     """
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    part = _part(path)
     try:
         with open(part, "wb") as file:
             yield file
@@ -43,14 +50,28 @@ def whole(path: Path) -> Iterator[IO[bytes]]:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise cannot_write(path, error) from error
+            raise cannot_write(path, error, way_out) from error
         raise
 
 
-GO_ON = (
-    "What was finished before is kept; make room or choose another place, and give the same command with the same "
-    "--out to go on."
-)
+def try_whole(path: Path, way_out: str) -> None:
+    """Try whether `whole` could write a file, and leave nothing behind.
+
+    Raises
+    ------
+    ResultsError
+        It could not.
+    """
+    part = _part(path)
+    try:
+        with open(part, "wb"):
+            part.unlink()
+    except OSError as error:
+        raise cannot_write(path, error, way_out) from error
+
+
+def _part(path: Path) -> Path:
+    return path.with_name(f"{path.name}.{os.getpid()}.part")
 
 
 def cannot_write(path: Path, error: OSError, way_out: str = GO_ON) -> ResultsError:
@@ -58,10 +79,10 @@ def cannot_write(path: Path, error: OSError, way_out: str = GO_ON) -> ResultsErr
     return ResultsError(f"{path} cannot be written: {error.strerror or error}. {way_out}")
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: Any, way_out: str = GO_ON) -> None:
     """Write data as indented JSON; a number that is not finite is a ValueError."""
     text = json.dumps(data, indent=2, sort_keys=False, allow_nan=False) + "\n"
-    with whole(path) as file:
+    with whole(path, way_out) as file:
         file.write(text.encode())
 
 
@@ -81,6 +102,14 @@ def read_json(path: Path) -> Any:
         raise ResultsError(f"{path} is damaged ({error}); delete it to have it made again") from error
 
 
+def made_again(path: Path) -> str:
+    """Say how a table of a run's folder is made again, or nothing where `path` stands in no such folder."""
+    folder = path.parent
+    if not (folder / "manifest.json").is_file():
+        return ""
+    return f"Delete {folder / 'result.json'}, if it is there; then `mapek resume {folder}` makes the tables again."
+
+
 def read_npz(path: Path, way_out: str, names: Iterable[str] | None = None) -> dict[str, npt.NDArray[Any]]:
     """Read arrays of an ``.npz``, all of them if no `names` are given.
 
@@ -94,4 +123,4 @@ def read_npz(path: Path, way_out: str, names: Iterable[str] | None = None) -> di
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in (archive.files if names is None else names)}
     except DAMAGE as error:
-        raise ResultsError(f"{path} is damaged ({error}). {way_out}") from error
+        raise ResultsError(f"{path} is damaged ({error}). {way_out}".rstrip()) from error

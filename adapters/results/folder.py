@@ -1,7 +1,8 @@
 """The folder of a run.
 
 config-AGENT.json     effective config, which `mapek run` takes as it is
-manifest.json         what runs, with seeds and versions; and which command began it, in which folder
+manifest.json         what runs, with seeds and versions, those of the user's own modules by their SHA-256; and which
+                      command began it, in which folder
 chunks/               finished trials, as they come; gone when the run is complete. Of a trial that failed,
                       broken-UNIT.npz holds the passes before the failure
 episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
@@ -15,6 +16,7 @@ A unit of work is a trial, or one loop of it: unit ``trial * loops + loop``. Wha
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import itertools
 import json
@@ -25,17 +27,19 @@ import time
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from adapters.results.chunk import read_arrays, read_chunk, remove_parts
-from adapters.results.files import cannot_write, read_json, read_npz, whole, write_json
+from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
+from adapters.results.own_code import other_version, own_modules
 from adapters.results.table import read_episodes, read_last, write_npz
 from mape import __version__
 from mape.config import Config
-from mape.errors import ResultsError
+from mape.errors import MapekError, ResultsError
 from mape.tables import first_difference
 from mape.trials import TrialResult
 
@@ -44,6 +48,9 @@ FORMAT = 2
 
 BEGUN_BY = ("command", "cwd")
 """Entries of a manifest that do not say what runs: the same run may be gone on with from elsewhere."""
+
+MODULES = "modules"
+"""Entry of a manifest for the user's own code, see `own_modules`; older ones have none."""
 
 
 def versions() -> dict[str, str]:
@@ -92,7 +99,7 @@ def read_manifest(path: Path, way_out: str = "name the folder that `mapek` wrote
         It is no folder of a run of ours, or its manifest is damaged.
     """
     manifest = path / "manifest.json"
-    if not manifest.is_file():
+    if not os.path.isfile(manifest):  # which says no of a name that is too long; a Path raises
         raise ResultsError(f"{path} holds no run of ours; name the folder that `mapek` wrote (results/NAME-DATE-TIME)")
     try:
         there = read_json(manifest)
@@ -172,9 +179,10 @@ class RunFolder:
             "trace": None if trace is None else list(trace),
             "versions": versions(),
         }
-        # Before anything is written there: a folder of someone else's is left as it is.
-        self._refuse_foreign()
+        self._kind = kind
         try:
+            # Before anything is written there: a folder of someone else's is left as it is.
+            self._refuse_foreign()
             path.mkdir(parents=True, exist_ok=True)
             self._lock = open(path / ".lock", "a")  # noqa: SIM115 - held until `close`
         except OSError as error:
@@ -206,22 +214,33 @@ class RunFolder:
         if not manifest.exists():
             self._refuse_foreign()
             remove_parts(self.path)
-            for agent in self.configs:
-                write_json(self.path / f"config-{agent}.json", wanted["agents"][agent])
-            write_json(manifest, {**wanted, "command": self.command, "cwd": os.getcwd()})
+            self._write_configs(wanted)
+            own = own_modules(self.configs.values())
+            write_json(manifest, {**wanted, MODULES: own, "command": self.command, "cwd": os.getcwd()})
             return
         if (self.path / "result.json").exists():
             raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
         there = read_manifest(self.path, "choose another --out")
-        runs = {name: value for name, value in there.items() if name not in BEGUN_BY}
+        runs = {name: value for name, value in there.items() if name not in (*BEGUN_BY, MODULES)}
         if runs != wanted:
             what, had, has = first_difference(runs, wanted)
             raise ResultsError(
                 f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; give the same command to "
                 "continue it, or choose another --out"
             )
+        if (said := other_version(there.get(MODULES) or {})) is not None:
+            raise ResultsError(
+                f"{self.path} holds an unfinished run that was begun with {said}. Its results would belong to neither. "
+                "Put the file back as it was to continue, or choose another --out; or, where what is finished would "
+                f"come out the same, take the module out of {manifest}"
+            )
         remove_parts(self.path)
+        self._write_configs(wanted)
         self.resumed = sum(len(self.finished(agent)) for agent in self.configs)
+
+    def _write_configs(self, wanted: Mapping[str, Any]) -> None:
+        for agent in self.configs:
+            write_json(self.path / f"config-{agent}.json", wanted["agents"][agent])
 
     def chunk_stem(self, agent: str, first: int, count: int) -> str:
         """Return where a chunk's results belong."""
@@ -259,14 +278,15 @@ class RunFolder:
 
     def q_tables(self, agent: str) -> dict[int, tuple[npt.NDArray[np.float64], tuple[int, ...]]]:
         """Return values and action ids at the end of each trial."""
-        arrays = read_npz(self.path / f"q_tables-{agent}.npz", "Run the same command again.")
+        path = self.path / f"q_tables-{agent}.npz"
+        arrays = read_npz(path, made_again(path))
         trials = sorted(int(name[2:]) for name in arrays if name.startswith("q_"))
         return {t: (arrays[f"q_{t}"], tuple(arrays[f"actions_{t}"].tolist())) for t in trials}
 
     def q_table(self, agent: str, unit: int) -> tuple[npt.NDArray[np.float64], tuple[int, ...]]:
         """Return values and action ids at the end of one trial."""
         path, names = self.path / f"q_tables-{agent}.npz", (f"q_{unit}", f"actions_{unit}")
-        values, actions = read_npz(path, "Run the same command again.", names).values()
+        values, actions = read_npz(path, made_again(path), names).values()
         return values, tuple(actions.tolist())
 
     def trace(self, agent: str) -> npt.NDArray[np.void] | None:
@@ -278,6 +298,18 @@ class RunFolder:
         """Write the result, and remove the chunks that are now in the tables."""
         write_json(self.path / "result.json", {"command": self.command, "versions": versions(), **result})
         shutil.rmtree(self.path / "chunks", ignore_errors=True)
+
+    def kept(self) -> str:
+        """Say in a sentence what there is of the run, and how to go on."""
+        if (self.path / "result.json").exists():
+            return f"The run is complete; all of it is in {self.path}."
+        if self._kind == "up":
+            return f"All that was logged is kept; `mapek resume {self.path}` continues."
+        kept = sum(len(self.finished(agent)) for agent in self.configs)
+        wanted = sum(config.units for config in self.configs.values())
+        units = "trials" if all(config.loops == 1 for config in self.configs.values()) else "loops of trials"
+        continues = f"`mapek resume {self.path}` continues"
+        return f"{kept:,} of {wanted:,} {units} are finished and kept in {self.path}; {continues}."
 
     def close(self) -> None:
         """Let others have the folder."""
@@ -291,5 +323,11 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None and not isinstance(error, MapekError):
+            # Ctrl-C, or a reader that is gone, does not know of the folder.
+            with contextlib.suppress(MapekError):
+                error.add_note(self.kept())
         self.close()

@@ -30,7 +30,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.files import DAMAGE, whole
+from adapters.results.files import DAMAGE, made_again, whole
 from mape.errors import ResultsError
 
 DTYPE = np.dtype(
@@ -138,7 +138,9 @@ def _opened(path: str | Path, columns: Iterable[str]) -> Iterator[Any]:
                 raise ResultsError(f"{path} has no column {sorted(missing)[0]!r}; it has {', '.join(archive.files)}")
             yield archive
     except DAMAGE as error:
-        raise ResultsError(f"{path} is no whole table of episodes: {error}. Run the same command again.") from error
+        raise ResultsError(
+            f"{path} is no whole table of episodes: {error}. {made_again(Path(path))}".rstrip()
+        ) from error
 
 
 def _shape(archive: Any) -> tuple[int, int]:

@@ -14,9 +14,13 @@ from gymnasium.utils.env_checker import check_env
 from adapters.systems.gymnasium_system import make_env, rules_of
 from managed_systems import register_envs
 from mape.config import BoxGrid, SystemConfig
+from mape.states import FAULTS, told
 from mape.testing import Finding
 
 _DECORATION = re.compile(r"\x1b\[\d*m|WARN: ")  # Gymnasium's logger colours its warnings
+
+HUGE = 1e6
+"""A bound beyond it says no more of the observations than an infinite one does."""
 
 
 def is_registered(name: str) -> bool:
@@ -32,15 +36,23 @@ def default_view(name: str) -> SystemConfig:
         grid = None
         space: Any = env.observation_space
         if isinstance(space, spaces.Box):
-            size = int(np.prod(space.shape))
-            low = np.clip(np.ravel(space.low), -10.0, 10.0).tolist()
-            high = np.clip(np.ravel(space.high), -10.0, 10.0).tolist()
-            grid = BoxGrid(low=tuple(low), high=tuple(high), bins=(3,) * size)
+            low, high = np.ravel(space.low).tolist(), np.ravel(space.high).tolist()
+            spans = [_span(float(a), float(b)) for a, b in zip(low, high, strict=True)]
+            grid = BoxGrid(low=tuple(a for a, _ in spans), high=tuple(b for _, b in spans), bins=(3,) * len(spans))
         capped = env.spec is not None and env.spec.max_episode_steps is not None
         has_own = rules_of(env) is not None
         return SystemConfig(id=name, max_steps=None if capped or has_own else 200, discretise=grid)
     finally:
         env.close()
+
+
+def _span(low: float, high: float) -> tuple[float, float]:
+    """Return the bounds of a dimension, with others for those that are infinite, or as good as that, or equal."""
+    if low < -HUGE:
+        low = min(-10.0, high - 20.0)
+    if high > HUGE:
+        high = max(10.0, low + 20.0)
+    return (low, high) if low < high else (low - abs(low) - 1.0, high + abs(high) + 1.0)
 
 
 def check_environment(config: SystemConfig) -> Finding:
@@ -51,8 +63,8 @@ def check_environment(config: SystemConfig) -> Finding:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             check_env(env.unwrapped, skip_render_check=True)
-    except Exception as error:
-        return Finding(clause, "failed", f"{type(error).__name__}: {error}")
+    except FAULTS as error:
+        return Finding(clause, "failed", told(error))
     finally:
         env.close()
     remarks = "; ".join(sorted({_DECORATION.sub("", str(warning.message).splitlines()[0]) for warning in said}))

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from adapters.systems.refusals import refusal
 from adapters.systems.state_index import state_index
 from adapters.systems.tabulated import Tabulated
 from adapters.systems.wrappers import altering_wrapper, least_cap, step_caps
@@ -70,7 +71,7 @@ def _make_by_id(config: SystemConfig) -> gymnasium.Env[Any, Any]:
             f"system {config.id!r} needs the module {name!r}, which is neither installed nor in this folder"
         ) from error
     except Exception as error:
-        raise ConfigError(f"system {config.id!r} with options {config.options}: {error}") from error
+        raise refusal(config, error) from error
 
 
 def rules_of(env: gymnasium.Env[Any, Any]) -> StepRules | None:
@@ -117,7 +118,7 @@ class GymnasiumSystem:
         self.redrivable = bool(declared_redrivable if config.redrivable is None else config.redrivable)
         self._block = getattr(self.rules, "episode_draws", 0)
         self._mask: npt.NDArray[np.int8] | None = None
-        self._first_action = 0
+        self._actions = self._action_range()
         self._windows: tuple[int, int, tuple[int, ...]] | None = None
 
     def available(self, episode: int) -> tuple[int, ...] | None:
@@ -133,7 +134,13 @@ class GymnasiumSystem:
         return self._windows[2]
 
     def begin(self, episode: Episode) -> tuple[int, tuple[int, ...]]:
-        """Reset the environment for an episode; return the first state and the available actions."""
+        """Reset the environment for an episode; return the first state and the available actions.
+
+        Raises
+        ------
+        ManagedSystemError
+            It offers an action that its action space does not have, or a mask of another length.
+        """
         options: dict[str, Any] = {"episode": episode.number}
         if self.rules is not None:
             # Where the config's step cap is below the system's own, the rest of the block is never reached.
@@ -141,17 +148,28 @@ class GymnasiumSystem:
             uniforms[: len(episode.uniforms)] = episode.uniforms
             options["uniforms"] = uniforms
         seen, info = self.env.reset(seed=episode.seed, options=options)
+        self._actions = self._action_range()
         self._see_mask(info)
         state = self._index(seen)
-        # Asked each time: an environment may reassign its action space.
-        space: Any = self.env.action_space
-        self._first_action = int(space.start)
-        if "available_actions" in info:
-            return state, tuple(int(action) for action in info["available_actions"])
-        return state, tuple(range(self._first_action, self._first_action + int(space.n)))
+        if "available_actions" not in info:
+            return state, tuple(self._actions)
+        offered = tuple(int(action) for action in info["available_actions"])
+        for action in offered:
+            if action not in self._actions:
+                raise ManagedSystemError(
+                    f"{self.name} offers action {action} in info['available_actions'] = {offered} of episode "
+                    f"{episode.number}; its action space has {self._actions[0]} .. {self._actions[-1]}"
+                )
+        return state, offered
 
     def step(self, action: int, context: npt.NDArray[np.float64]) -> tuple[int, float, bool, bool]:
-        """Act; return next state, reward, terminated, truncated."""
+        """Act; return next state, reward, terminated, truncated.
+
+        Raises
+        ------
+        ManagedSystemError
+            A signal that it declares is missing, or its mask is of another length than its action space.
+        """
         seen, reward, terminated, truncated, info = self.env.step(action)
         self._see_mask(info)
         if self.signal_names:
@@ -167,7 +185,7 @@ class GymnasiumSystem:
 
     def explorable(self, action: int) -> bool:
         """Look the action up in the present state's ``info["action_mask"]``; without one, all may be tried."""
-        return self._mask is None or bool(self._mask[action - self._first_action])
+        return self._mask is None or bool(self._mask[action - self._actions.start])
 
     def enable(self, actions: tuple[int, ...]) -> None:
         """Switch reserve actions on.
@@ -211,5 +229,16 @@ class GymnasiumSystem:
         """Whether the environment says what it carries from one episode to the next."""
         return hasattr(self._base, "get_state") and hasattr(self._base, "set_state")
 
+    def _action_range(self) -> range:
+        # Asked at each reset: an environment may reassign its action space.
+        space: Any = self.env.action_space
+        return range(int(space.start), int(space.start + space.n))
+
     def _see_mask(self, info: dict[str, Any]) -> None:
-        self._mask = info.get("action_mask")
+        self._mask = mask = info.get("action_mask")
+        # An array is asked itself: NumPy's function takes a while, in each step.
+        if mask is not None and getattr(mask, "shape", None) != (len(self._actions),) != np.shape(mask):
+            raise ManagedSystemError(
+                f"{self.name} gave an info['action_mask'] of shape {np.shape(mask)}; it has a mark for each of "
+                f"{len(self._actions)} actions, shape ({len(self._actions)},)"
+            )

@@ -25,7 +25,8 @@ def state_index(space: spaces.Space[Any], grid: BoxGrid | None, name: str) -> tu
     """
     size, index = _index(space, grid, name)
     if size > LARGEST:
-        raise ConfigError(f"{name} has {size} states; a table of more than {LARGEST} does not fit. Use fewer bins.")
+        many = str(size) if size < 10**15 else "more than 10^15"  # Python does not print a number of any length
+        raise ConfigError(f"{name} has {many} states; a table of more than {LARGEST} does not fit. Use fewer bins.")
     return size, index
 
 
@@ -39,9 +40,11 @@ def _index(space: spaces.Space[Any], grid: BoxGrid | None, name: str) -> tuple[i
         return int(space.n), lambda seen: int(seen) - start
     if isinstance(space, spaces.MultiDiscrete):
         counts = [int(n) for n in np.ravel(space.nvec)]
+        starts = [int(first) for first in np.ravel(space.start)]
         weights = [math.prod(counts[i + 1 :]) for i in range(len(counts))]
         return math.prod(counts), lambda seen: sum(
-            int(value) * weight for value, weight in zip(np.ravel(seen).tolist(), weights, strict=True)
+            (int(value) - first) * weight
+            for value, first, weight in zip(np.ravel(seen).tolist(), starts, weights, strict=True)
         )
     if isinstance(space, spaces.MultiBinary):
         bits = int(np.prod(space.shape))

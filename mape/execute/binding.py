@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mape.compose import Bindings, Composed, Rule, specialise
+from mape.compose import Bindings, Composed, Rule, Uncompilable, specialise
 from mape.execute import drive, episode
 from mape.ports import Learner, StepRules
 
@@ -17,8 +17,31 @@ Driver = Callable[..., tuple[int, int, float, float, float]]
 
 
 def by_rules(rules: StepRules, learner: Learner, arguments: tuple[Any, ...]) -> Driver:
-    """Return the episode as one compiled call, for the types of `arguments`."""
-    return specialise(_compiled(composed(rules, learner)), arguments, "the episode of this system and learner")
+    """Return the episode as one compiled call, for the types of `arguments`.
+
+    Raises
+    ------
+    Uncompilable
+        A rule cannot be compiled; it is said whose.
+    """
+    try:
+        return specialise(_compiled(composed(rules, learner)), arguments, "the episode of this system and learner")
+    except Uncompilable as error:
+        raise _named(error, learner) from error
+
+
+def _named(error: Uncompilable, learner: Learner) -> Uncompilable:
+    """Say whether it is the learner's rules that cannot be compiled, which are tried alone, or the system's."""
+    from mape.testing.learners import probe  # what it needs is not needed by a run
+
+    numbers, rows, rate = np.zeros(1), np.zeros(1, dtype=np.int64), np.zeros((1, len(learner.rate_names)))
+    arguments = (np.zeros((2, 2)), rows, rows, 0.5, numbers, rate, numbers, numbers)
+    alone = Composed(probe, {"value": learner.value, "step_size": learner.step_size})
+    try:
+        specialise(alone.compiled(), arguments, "the rules of this learner")
+    except Uncompilable as told:
+        return Uncompilable(f"learner {type(learner).__name__}: {told}")
+    return Uncompilable(f"the system's rules: {error}")
 
 
 def composed(rules: StepRules, learner: Learner) -> Composed:

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import Field
 
 from knowledge.records import Direction
-from knowledge.rows import DIRECTIONS, DOWN, UNKNOWN, UP
+from knowledge.rows import DOWN, SIDES, UNKNOWN, UP
 from mape.ports import QuietRule
 from mape.specs import PartConfig
 
@@ -108,7 +108,7 @@ class TwoWindow:
     @property
     def direction(self) -> Direction:
         """Side to which the mean moved, by the last z."""
-        return _SIDES[side(self._state[0])]
+        return SIDES[side(self._state[0])]
 
     @property
     def statistic(self) -> float | None:
@@ -137,6 +137,3 @@ class TwoWindow:
         values = [float(v) for v in state["values"]][-self._length :]
         z = math.nan if state["z"] is None else float(state["z"])
         self._state[: 2 + len(values)] = [z, float(len(values)), *values]
-
-
-_SIDES: dict[int, Direction] = {code: name for name, code in DIRECTIONS.items()}

@@ -12,18 +12,16 @@ import numpy.typing as npt
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge, Observation, QTable, Reading, Symptom
 from knowledge.log import Pass
-from knowledge.rows import DIRECTIONS, NEXT_EPSILON, SIGNALS, UNKNOWN
+from knowledge.rows import NEXT_EPSILON, SIDES, SIGNALS, UNKNOWN
 from mape.analyze import Analyze
-from mape.compose import Composed, Rule, specialise
+from mape.compose import Composed, Rule, Uncompilable, specialise
 from mape.execute import Execute
 from mape.execute.binding import composed
 from mape.monitor import Monitor
 from mape.plan import Plan
 from mape.ports import Detector, QuietRule
-from mape.stretch import passes
+from mape.stretch import faults, passes
 from mape.stretch.quiet import obstacle, quiet_of
-
-_SIDES = {code: name for name, code in DIRECTIONS.items()}
 
 
 def obstacles(execute: Execute, monitor: Monitor, analyze: Analyze, plan: Plan) -> list[str]:
@@ -50,6 +48,8 @@ class Stretches:
     ------
     ConfigError
         A rule cannot be compiled.
+    PartError
+        What a part declares is no rule over numbers, or one that reaches beyond its own.
     """
 
     def __init__(self, execute: Execute, monitor: Monitor, analyze: Analyze, plan: Plan, knowledge: Knowledge) -> None:
@@ -74,8 +74,13 @@ class Stretches:
         self._integers = self._heads.view(np.int64)
         self._directions = np.zeros((most, len(self._watched)), dtype=np.int64)
         assert execute.rules is not None
-        self._bound = _compiled(composed(execute.rules, execute.learner), *(rule.function for rule in rules))
-        self._take(execute.q_table)
+        faults.floats(self._declaring(), rules)  # looked at before anything is compiled
+        faults.check_reach(self._declaring(), rules, len(names))
+        try:
+            self._bound = _compiled(composed(execute.rules, execute.learner), *(rule.function for rule in rules))
+            self._take(execute.q_table)
+        except Uncompilable as error:
+            raise faults.named(error, self._declaring(), rules, len(names)) from error
 
     @property
     def fit(self) -> bool:
@@ -131,8 +136,9 @@ class Stretches:
         rules = self._rules()
         if _forms(rules) != self._forms:
             return passes.BROKEN  # a part put another rule, or more or fewer numbers, in the place of its own
-        self._state[: self._bounds[-1, 1]] = [number for rule in rules for number in rule.state]
-        self._params[: self._bounds[-1, 3]] = [number for rule in rules for number in rule.params]
+        state, params = faults.floats(self._declaring(), rules)
+        self._state[: len(state)] = state
+        self._params[: len(params)] = params
         for k, (_, detector) in enumerate(self._monitor.detectors, -len(self._watched)):
             self._heads[-1, k] = math.nan if _has_none(detector) else 0.0
         raised: BaseException | None = None
@@ -173,11 +179,18 @@ class Stretches:
         schedule = getattr(planner, "schedule", None)
         return (planner, self._analyze.analyzer, *detectors, schedule, self._execute.learner)
 
+    def _declaring(self) -> tuple[Any, ...]:
+        detectors = [detector for _, detector in self._monitor.detectors]
+        return (self._plan.planner, self._analyze.analyzer, *detectors)
+
     def _rules(self) -> list[QuietRule]:
         # Asked anew: a part may have put another list in the place of its numbers.
-        parts = (self._plan.planner, self._analyze.analyzer, *(detector for _, detector in self._monitor.detectors))
-        found = [quiet_of(part) for part in parts]
-        return [rule for rule in found if rule is not None]
+        found = []
+        for k, part in enumerate(self._declaring()):
+            if (rule := quiet_of(part)) is not None:
+                faults.check_shape(k, part, rule)
+                found.append(rule)
+        return found
 
     def _arguments(self, first: int, count: int, epsilon: float, at: int) -> tuple[Any, ...]:
         return (
@@ -252,7 +265,7 @@ def _quiet_pass(
     """Return the four records of a quiet pass."""
     signals = dict(zip(names, values or (0.0,) * len(names), strict=True))
     readings = tuple(
-        Reading(name, signals[name], None if math.isnan(statistic) else statistic, False, _SIDES[side])
+        Reading(name, signals[name], None if math.isnan(statistic) else statistic, False, SIDES[side])
         for name, statistic, side in zip(
             watched, statistics or (0.0,) * len(watched), directions or (UNKNOWN,) * len(watched), strict=True
         )

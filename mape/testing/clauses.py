@@ -14,6 +14,7 @@ from knowledge import (
     to_json,
 )
 from mape.errors import PartError
+from mape.states import FAULTS
 
 
 class Finding(NamedTuple):
@@ -84,8 +85,9 @@ def outcome(check: str, clause: Callable[[], None]) -> Finding:
         return Finding(check, "failed", str(broken))
     except Noted as note:
         return Finding(check, "note", str(note))
-    except Exception as error:
-        return Finding(check, "failed", f"{type(error).__name__} was raised: {error}")
+    except FAULTS as error:
+        text = f": {error}" if str(error) else ""
+        return Finding(check, "failed", f"{type(error).__name__} was raised{text}")
     return Finding(check, "ok")
 
 

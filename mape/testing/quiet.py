@@ -10,17 +10,16 @@ import numpy as np
 
 from knowledge import ChangePlan, ChangeRequest, Knowledge, Symptom
 from knowledge.records import Direction
-from knowledge.rows import DIRECTIONS
+from knowledge.rows import SIDES
 from mape.compose import Composed, specialise
 from mape.errors import ConfigError
 from mape.ports import Json, QuietRule
+from mape.stretch.faults import misshapen
 from mape.stretch.quiet import obstacle, quiet_of
 from mape.testing.clauses import Broken, Clause, Noted, Script, plain_json
 
 # Bound by `mape.compose`.
 rule: Any = None
-
-_SIDES: dict[int, Direction] = {code: name for name, code in DIRECTIONS.items()}
 
 
 def probe_one(state: Any, params: Any, given: Any, told: Any) -> None:
@@ -81,6 +80,8 @@ def _declared(kind: str, part: Any) -> QuietRule:
         raise Noted(f"{why}, so that its passes are made in Python")
     if type(found.state) is not list:
         raise Broken(f"quiet.state is a {type(found.state).__name__}; it is the list on which the methods work")
+    if (fault := misshapen(found)) is not None:
+        raise Broken(f"quiet.{fault}")
     for name, numbers in (("state", found.state), ("params", found.params)):
         if odd := [number for number in numbers if not isinstance(number, (int, float))]:
             raise Broken(f"quiet.{name} holds {odd[0]!r}; it holds numbers alone")
@@ -172,10 +173,10 @@ class _Detector(_StandIn):
                 raise Broken(f"its rule alarms at {x}, or gives an infinite statistic, and update({x}) does not alarm")
             self.statistic, self.direction = self.part.statistic, self.part.direction
             return alarm
-        if told[2] not in _SIDES:
+        if told[2] not in SIDES:
             raise Broken(f"its rule names the side {told[2]:g}; give a code of knowledge.rows.DIRECTIONS")
         self.statistic = None if math.isnan(told[1]) else told[1]
-        self.direction = _SIDES[int(told[2])]
+        self.direction = SIDES[int(told[2])]
         return False
 
 

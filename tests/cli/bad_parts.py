@@ -81,6 +81,16 @@ class RateNan(Planned):
         return plan._replace(learning_rate=(float("nan"), 0.5, 1.0))
 
 
+class RateNone(Planned):
+    def spoil(self, plan):
+        return plan._replace(learning_rate=None)
+
+
+class AddsList(Planned):
+    def spoil(self, plan):
+        return plan._replace(add=[1])
+
+
 class DropsUnknown(Planned):
     def spoil(self, plan):
         return plan._replace(drop=(17,))

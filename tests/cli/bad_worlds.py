@@ -45,11 +45,18 @@ class NoActions(Fine):
 
 
 class NegativeAction(Fine):
+    def __init__(self):
+        super().__init__()
+        self.action_space = Discrete(2, start=-1)
+
     def info(self):
         return {"available_actions": (0, -1)}
 
 
 class LargeAction(Fine):
+    def __init__(self):
+        super().__init__(65)
+
     def info(self):
         return {"available_actions": (0, 64)}
 
@@ -60,6 +67,9 @@ class DoubleAction(Fine):
 
 
 class OtherActions(Fine):
+    def __init__(self):
+        super().__init__(7)
+
     def info(self):
         return {"available_actions": (0, 1) if self.episode < 3 else (5, 6)}
 

@@ -94,6 +94,27 @@ def test_reproduce_traffic_says_a_curve_by_episode_and_the_detection_of_both_dri
     assert found["agents"]["morphin"]["detection"][0]["recall"] == 1
 
 
+@pytest.mark.parametrize(
+    ("more", "trials"), [(("--set", "trials=3"), 3), (("--set", "trials=3", "--trials", 2), 2), (("--trials", 1), 1)]
+)
+def test_reproduce_has_its_own_number_of_trials_only_where_none_is_given(
+    mapek: Mapek, more: tuple[object, ...], trials: int
+) -> None:
+    found = mapek("reproduce", "jump", "--set", "episodes=2", *more, "--workers", 1, "--no-statistics", *PIPED)
+
+    assert found.json["trials"] == trials
+
+
+@pytest.mark.parametrize("experiment", ["traffic", "jump"])
+def test_numbers_found_before_are_said_to_be_of_unchanged_settings(mapek: Mapek, experiment: str) -> None:
+    some = ("reproduce", experiment, "--trials", 1, "--workers", 1, "--no-figures", "-q", "--json", "-")
+    changed = mapek(*some, "--set", "episodes=20", "--set", "learner.discount=0.1").err
+
+    assert "before: found earlier with these settings" not in changed
+    assert "before: found earlier with the experiment's own settings, not these, over" in changed
+    assert "nan" not in changed
+
+
 def test_reproduce_jump_says_steps_before_and_after_and_the_share_of_optimal_paths(mapek: Mapek) -> None:
     found = mapek("reproduce", "jump", "--trials", 2, "--workers", 1, *PIPED).json
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from adapters.cli.reproduce import shortest_path
 from adapters.experiments.metrics import (
     Detection,
     convergence,
     detection,
     greedy_length,
     recovery,
+    shortest_path,
     stages,
     trailing_mean,
 )

@@ -117,15 +117,16 @@ def drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         yield folder, seen
 
 
-def test_only_drifts_that_all_agents_meet_are_marked(drawn) -> None:
+def test_each_agent_has_the_drifts_that_it_meets(drawn) -> None:
     folder, seen = drawn
     assert {path.suffix for path in pictures.pictures_of_traffic(folder)} == {".png", ".pdf"}
-    assert list(seen["learning_curve"][1]["drifts"]) == [4]
+    assert seen["learning_curve"][1]["drifts"] == {"MORPHIN": (2, 4), "Q-learning": (4, 5)}
 
 
 def test_the_heatmaps_say_whose_they_are_and_of_which_trial(drawn) -> None:
     folder, seen = drawn
     pictures.pictures_of_jump(folder)
     ((panels,), options) = seen["q_heatmaps"]
-    assert [panel.title for panel in panels] == ["trial 0: MORPHIN", "trial 0: Q-learning"]
+    assert [panel.title for panel in panels] == ["MORPHIN", "Q-learning"]
+    assert options["of"] == "trial 0"
     np.testing.assert_array_equal(options["goals"], [[2, 2], [0, 2]])

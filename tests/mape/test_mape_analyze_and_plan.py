@@ -1,5 +1,7 @@
 import json
+import re
 
+import numpy as np
 import pytest
 
 from knowledge import ChangeRequest, Drift, Knowledge, Log, QTable, Reading, RowLayout, Symptom
@@ -219,6 +221,30 @@ def test_an_exploration_rate_outside_0_to_1_is_the_planners_fault(epsilon):
     part = Fixed(planner().start(0)._replace(epsilon=epsilon))
     with pytest.raises(PartError, match=r"planner Fixed gave epsilon .* a number in \[0, 1\]"):
         Plan(part, shared, sent.append).on_request(request(1))
+    assert (sent, shared.plan) == ([], None)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "legal"),
+    [
+        ("add", [7], "a tuple of action ids, each an int"),
+        ("add", (np.int64(7),), "a tuple of action ids, each an int"),
+        ("drop", None, "a tuple of action ids, each an int"),
+        ("enable", (True,), "a tuple of action ids, each an int"),
+        ("learning_rate", None, "the learner takes 3 numbers, in a tuple"),
+        ("learning_rate", [0.1, 0.1, 0.0], "the learner takes 3 numbers, in a tuple"),
+        ("learning_rate", (0.1, None, 0.0), "the learner takes 3 numbers, in a tuple"),
+        ("reset_detector", None, "True or False"),
+        ("adopt", 12, "the SHA-256 of a remembered Q-table, as text, or None"),
+    ],
+)
+def test_a_value_of_another_type_in_a_plan_is_the_planners_fault(field, value, legal):
+    sent, shared = [], knowledge()
+    part = Fixed(planner().start(0)._replace(**{field: value}))
+    named = field.replace("learning_rate", "the learning rate")
+    said = re.escape(f"planner Fixed gave {named} {value!r} for pass 6;") + f".*{legal}"
+    with pytest.raises(PartError, match=said):
+        Plan(part, shared, sent.append).on_request(request(6))
     assert (sent, shared.plan) == ([], None)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from composed_rules import below, both, less, root, scaled
 from mape_runs import GRID, config, hashes, loop_of
+from numba import njit
 
 from mape.compose import Composed, cache_folder, specialise
 from mape.errors import ConfigError
@@ -262,6 +263,12 @@ def test_what_is_apart_has_a_module_of_its_own_from_which_others_import_it():
         assert "SCALE" not in other.source()
 
 
+def test_it_is_known_whether_an_author_compiled_a_function_himself():
+    assert not scaled_by(root).compiled_by_others
+    assert scaled_by(njit(root)).compiled_by_others
+    assert Composed(both, {"first": root, "second": scaled_by(njit(root))}).compiled_by_others
+
+
 def test_two_templates_that_mean_different_things_by_one_name_are_told_apart(tmp_path):
     (tmp_path / "a_rule.py").write_text("SCALE = 3.0\n\n\ndef rule(x):\n    return x\n")
     (tmp_path / "a_template.py").write_text(
@@ -325,7 +332,9 @@ def test_a_name_that_numpy_does_not_have_is_refused_too():
 
 def test_a_detector_whose_rule_allocates_is_refused_before_the_first_pass():
     loop = loop_of(config(monitor={"detectors": ["stretch_parts:Allocating"]}))
-    with pytest.raises(ConfigError, match=r"^rule allocates cannot be compiled by Numba: it makes an array"):
+    with pytest.raises(
+        ConfigError, match=r"^detector monitor.0 Allocating: rule allocates cannot be compiled by .* makes an array"
+    ):
         loop.run(1)
     assert loop.log.passes == 0
     plain = loop_of(config(monitor={"detectors": ["stretch_parts:Allocating"]}, execute={"engine": "python"}))

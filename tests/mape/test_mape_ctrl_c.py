@@ -1,7 +1,9 @@
 """A Ctrl-C at any line changes no bit of a run that then goes on."""
 
 import itertools
+import os
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -183,3 +185,78 @@ def test_a_loop_runs_in_a_thread_too():
     thread.start()
     thread.join()
     assert hashes(loop) == undisturbed("compiled")[1]
+
+
+COMPILED = """
+import signal
+import sys
+from numba.core.codegen import JITCodeLibrary
+from composed_rules import root, scaled
+from mape.compose import Composed, specialise
+from mape.ctrl_c import CtrlC
+
+hook, presses = JITCodeLibrary._object_compiled_hook, int(sys.argv[1])
+
+
+def pressed(library, module, code):
+    # Called by LLVM, through which no exception can go.
+    global presses
+    while presses and module.name == "scaled":
+        presses -= 1
+        signal.raise_signal(signal.SIGINT)
+    hook(module, code)
+
+
+JITCodeLibrary._object_compiled_hook = classmethod(pressed)
+bound = Composed(scaled, {"rule": root})
+
+
+def compiled():
+    try:
+        return specialise(bound.compiled(), (1.0,), "it")
+    except KeyboardInterrupt:
+        return "stopped"
+
+
+if sys.argv[2] == "alone":
+    told = [compiled()]
+else:
+    told = []
+    try:
+        with CtrlC():
+            told.append(compiled())
+        told.append("swallowed")
+    except KeyboardInterrupt:
+        told.append("stopped afterwards")
+function = compiled()
+print(*(each if isinstance(each, str) else "compiled" for each in told), function(4.0) == bound.python()(4.0), sep=", ")
+"""
+
+
+@pytest.mark.parametrize(
+    ("presses", "where", "told"),
+    [
+        (1, "alone", "stopped, True"),
+        (1, "within", "compiled, stopped afterwards, True"),
+        (2, "alone", "stopped, True"),
+        (2, "within", "stopped, stopped afterwards, True"),
+    ],
+)
+def test_a_ctrl_c_while_code_is_compiled_is_neither_lost_nor_taken_for_a_fault_of_the_rule(
+    tmp_path, presses, where, told
+):
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILED, str(presses), where],
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), str(Path(mape.__file__).parents[1])]),
+            "MAPEK_CACHE": str(tmp_path),
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == told
+    if presses == 1:
+        assert done.stderr == ""

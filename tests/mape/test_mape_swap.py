@@ -16,12 +16,12 @@ from mape.config import SwapConfig
 from mape.errors import ConfigError, PartError, UnknownName
 from mape.execute.rules import QLearning
 from mape.monitor.page_hinkley import PageHinkley
-from mape.parts import make, parts_in
+from mape.parts import config_at, make, owner, parts_in, with_part
 from mape.plan.exponential import Exponential
 from mape.plan.morphin import Morphin
 from mape.plan.q_learning import QLearningPlanner
 from mape.specs import PartSpec
-from mape.swap import config_at, owner, replace_part, swap_sentence, vet, with_part
+from mape.swap import replace_part, swap_sentence, vet
 
 NEVER = {"name": "page_hinkley", "threshold": 1e6}
 

@@ -87,7 +87,7 @@ def test_a_finished_folder_is_refused_and_stays_as_it_is(finished: Path, capsys:
     ("override", "difference"),
     [
         ("seed=3", "agents.small.seed = 0, not 3"),
-        ("plan.alpha=0.2", "agents.small.plan.alpha = None, not 0.2"),
+        ("plan.alpha=0.2", "agents.small.plan.alpha = nothing, not 0.2"),
         ("system.options.max_steps=9", "agents.small.system.options.max_steps = 10, not 9"),
     ],
 )

@@ -1,6 +1,7 @@
 """A run that is killed, interrupted or crowded out leaves what is finished, and goes on from there."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -208,15 +209,42 @@ def test_standard_output_that_is_full_is_said(tmp_path: Path, command: tuple[str
     start = ("bash", "-c", f'exec {sys.executable} -m mape "$@" > /dev/full', "bash")
     full = run(*command, cwd=tmp_path, code=1, start=start)
 
+    kept = "" if command == ("list",) else " The run is complete; all of it is in out."
     assert full.stderr.splitlines()[-1] == (
-        "mapek: standard output cannot be written: No space left on device. Lead it to another place."
+        f"mapek: standard output cannot be written: No space left on device. Lead it to another place.{kept}"
     )
     assert "Traceback" not in full.stderr
     assert "Exception ignored" not in full.stderr
     assert command == ("list",) or result_of(tmp_path / "out")["passes"] == 20
 
 
-def test_a_run_that_fails_under_way_is_continued_once_the_part_is_mended(tmp_path: Path) -> None:
+SHOWN = (*SMALL, "--set", "episodes=2000", "--show", "1:2000", "--out", "out")
+
+
+def test_standard_output_that_is_full_while_trials_run_is_not_blamed_on_the_results(tmp_path: Path) -> None:
+    start = ("bash", "-c", f'exec {sys.executable} -m mape "$@" > /dev/full', "bash")
+    full = run(*SHOWN, cwd=tmp_path, code=1, start=start)
+
+    assert full.stderr == (
+        "mapek: standard output cannot be written: No space left on device. Lead it to another place. "
+        "0 of 1 trials are finished and kept in out; `mapek resume out` continues.\n"
+    )
+    assert leftovers(tmp_path) == []
+
+
+def test_a_reader_of_a_run_that_leaves_early_is_told_how_to_go_on(tmp_path: Path) -> None:
+    start = ("bash", "-c", f'set -o pipefail; {sys.executable} -m mape "$@" | head -1', "bash")
+    left = run(*SHOWN, cwd=tmp_path, code=1, start=start)
+
+    assert left.stdout.startswith("--- pass 1")
+    assert left.stderr == (
+        "mapek: nobody reads standard output any more. "
+        "0 of 1 trials are finished and kept in out; `mapek resume out` continues.\n"
+    )
+    assert leftovers(tmp_path) == []
+
+
+def test_a_run_that_fails_under_way_is_continued_with_the_mended_part_once_the_user_says_so(tmp_path: Path) -> None:
     part = tmp_path / "flaky.py"
     text = (
         "from mape.monitor.page_hinkley import PageHinkley\n\n"
@@ -238,6 +266,12 @@ def test_a_run_that_fails_under_way_is_continued_once_the_part_is_mended(tmp_pat
     assert leftovers(tmp_path / "out") == []
 
     part.write_text(text.format(limit=10**9))
+    refused = run(*command, cwd=tmp_path, code=1).stderr
+    assert "another version of module 'flaky'" in refused
+    assert refused.endswith("take the module out of out/manifest.json\n")
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    del manifest["modules"]["flaky"]
+    (tmp_path / "out" / "manifest.json").write_text(json.dumps(manifest))
     assert "continuing in out: 2 trials are finished already" in run(*command, cwd=tmp_path).stdout
 
 

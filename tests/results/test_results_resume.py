@@ -306,3 +306,96 @@ def test_a_finished_run_and_what_is_no_run_are_refused(here: Path, capsys: pytes
         capsys.readouterr()
         assert main(["resume", name]) == 1
         assert capsys.readouterr().err.startswith(f"mapek: {says}")
+
+
+@pytest.mark.parametrize("where", [(), ("--out", "out")], ids=["default", "out"])
+def test_ctrl_c_after_the_trials_names_the_folder_and_how_to_go_on(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], where: tuple[str, ...]
+) -> None:
+    def interrupt(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr("adapters.experiments.pictures.pictures_of_run", interrupt)
+        assert main(["run", "small.toml", "-q", "--workers", "1", "--trials", "3", *where]) == 130
+
+    (out,) = [Path("out")] if where else Path("results").iterdir()
+    said = f"3 of 3 trials are finished and kept in {out}; `mapek resume {out}` continues.\n"
+    assert capsys.readouterr().err == f"mapek: stopped. {said}"
+    assert main(["resume", str(out)]) == 0
+    assert list((out / "figures").iterdir())
+
+
+def test_ctrl_c_after_the_result_says_that_all_is_there(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("adapters.cli.common.write_json", interrupt)
+    assert main(["run", "small.toml", *QUIETLY, "--json", "found.json", "--out", "out"]) == 130
+    assert capsys.readouterr().err == "mapek: stopped. The run is complete; all of it is in out.\n"
+
+
+def test_json_that_fails_after_all_names_the_folder_where_the_result_is(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "elsewhere").mkdir()
+    finish = RunFolder.finish
+
+    def finish_and_remove(folder: RunFolder, result: Any) -> None:
+        finish(folder, result)
+        (here / "elsewhere").rmdir()
+
+    monkeypatch.setattr(RunFolder, "finish", finish_and_remove)
+    assert main(["run", "small.toml", *QUIETLY, "--json", "elsewhere/found.json", "--out", "out"]) == 1
+    assert capsys.readouterr().err == (
+        "mapek: elsewhere/found.json cannot be written: No such file or directory. The run is complete; all of it is "
+        "in out.\n"
+    )
+
+
+def read_q_tables(out: Path) -> None:
+    finished = RunFolder.__new__(RunFolder)  # as it is: it would not be opened again
+    finished.path = out
+    finished.q_tables("small")
+
+
+@pytest.mark.parametrize(
+    ("file", "read"),
+    [
+        ("episodes-small.npz", lambda out: read_episodes(out / "episodes-small.npz")),
+        ("q_tables-small.npz", read_q_tables),
+    ],
+)
+def test_a_table_that_is_cut_short_says_how_it_is_made_again_and_so_it_is(
+    here: Path, file: str, read: Callable[[Path], object]
+) -> None:
+    assert main(["run", "small.toml", *QUIETLY, "--trials", "2", "--out", "undisturbed"]) == 0
+    assert main(["run", "small.toml", *QUIETLY, "--trials", "2", "--out", "out"]) == 0
+    os.truncate(here / "out" / file, 100)
+
+    with pytest.raises(ResultsError) as failed:
+        read(here / "out")
+    assert str(failed.value).endswith(
+        f"Delete {here}/out/result.json, if it is there; then `mapek resume {here}/out` makes the tables again."
+    )
+    assert main(["resume", "out"]) == 1
+    (here / "out" / "result.json").unlink()
+    assert main(["resume", "out"]) == 0
+    assert hashes(here / "out") == hashes(here / "undisturbed")
+    assert_equal_tables(here / "out", here / "undisturbed")
+
+
+def test_a_config_that_is_gone_from_the_folder_is_written_again(here: Path, stop: Callable[..., None]) -> None:
+    stop("run", "small.toml", *QUIETLY, "--out", "out")
+    kept = (here / "out" / "config-small.json").read_bytes()
+    (here / "out" / "config-small.json").unlink()
+
+    assert main(["resume", "out"]) == 0
+    assert (here / "out" / "config-small.json").read_bytes() == kept
+
+
+def test_a_name_that_is_too_long_is_no_folder(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["resume", "x" * 300]) == 1
+    assert "holds no run of ours" in capsys.readouterr().err

@@ -1,0 +1,165 @@
+"""A run with parts of the user's own: the folder keeps which version of them it is, and mixes no two."""
+
+import hashlib
+import importlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium
+import pytest
+from gymnasium.envs.registration import registry
+from real_runs import contents, result_of
+
+from adapters.cli.main import main
+from adapters.results import RunFolder
+from mape.errors import ResultsError
+
+CONFIG = """\
+name = "own"
+episodes = 6
+
+[system]
+id = "mapek/Gridworld-v0"
+options = { size = [3, 3], start = [0, 0], goals = [[2, 2]], max_steps = 10 }
+
+[execute]
+engine = "python"
+"""
+DETECTOR = """\
+from mape.monitor.page_hinkley import PageHinkley
+
+class Mine(PageHinkley):
+    pass
+"""
+WATCHED = ("--set", 'monitor.detectors=["own_detector:Mine"]')
+RUN = ("run", "own.toml", *WATCHED, "--no-figures", "-q", "--workers", "1")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with a config and a detector, whose modules and environments are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    importlib.invalidate_caches()
+    modules, environments = set(sys.modules), dict(registry)
+    (tmp_path / "own.toml").write_text(CONFIG)
+    (tmp_path / "own_detector.py").write_text(DETECTOR)
+    yield tmp_path
+    registry.clear()
+    registry.update(environments)
+    for name in set(sys.modules) - modules:
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Run a command that stops before its tables are made."""
+
+    def run_until_then(*command: str) -> None:
+        def fail(folder: RunFolder, agent: str) -> None:
+            raise ResultsError("stopped here")
+
+        with monkeypatch.context() as context:
+            context.setattr(RunFolder, "assemble", fail)
+            assert main(list(command)) == 1
+
+    return run_until_then
+
+
+def sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def modules_of(folder: Path) -> object:
+    return json.loads((folder / "manifest.json").read_text())["modules"]
+
+
+@pytest.mark.parametrize("again", [("resume", "out"), (*RUN, "--out", "out")], ids=["resume", "the same command"])
+def test_a_run_whose_part_was_edited_meanwhile_is_not_gone_on_with_until_it_is_put_back(
+    here: Path, stop: Callable[..., None], capsys: pytest.CaptureFixture[str], again: tuple[str, ...]
+) -> None:
+    assert main([*RUN, "--out", "undisturbed"]) == 0
+    stop(*RUN, "--out", "out")
+    edited = DETECTOR.replace("pass", "patience = 3")
+    (here / "own_detector.py").write_text(edited)
+    before = contents(here / "out")
+    capsys.readouterr()
+
+    assert main(list(again)) == 1
+
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert f"module 'own_detector' ({here / 'own_detector.py'})" in said.err
+    assert f"{sha256(DETECTOR)[:12]} then, {sha256(edited)[:12]} now" in said.err
+    assert "choose another --out" in said.err
+    assert contents(here / "out") == before
+    (here / "own_detector.py").write_text(DETECTOR)
+    assert main(list(again)) == 0
+    assert result_of(here / "out") == result_of(here / "undisturbed")
+
+
+def test_a_module_that_is_nowhere_any_more_is_said(
+    here: Path, stop: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    stop(*RUN, "--out", "out")
+    manifest = json.loads(Path("out/manifest.json").read_text())
+    manifest["modules"]["own_helper"] = sha256("gone")
+    Path("out/manifest.json").write_text(json.dumps(manifest))
+    capsys.readouterr()
+
+    assert main(["resume", "out"]) == 1
+    assert "module 'own_helper'" in (said := capsys.readouterr().err)
+    assert "nowhere now" in said
+
+
+def test_an_older_manifest_keeps_no_modules_and_its_run_goes_on(here: Path, stop: Callable[..., None]) -> None:
+    stop(*RUN, "--out", "out")
+    manifest = json.loads(Path("out/manifest.json").read_text())
+    del manifest["modules"]
+    Path("out/manifest.json").write_text(json.dumps(manifest))
+
+    assert main(["resume", "out"]) == 0
+
+
+def test_what_is_installed_is_kept_as_a_version_and_not_as_a_module(here: Path) -> None:
+    assert main(["run", "own.toml", "--no-figures", "-q", "--set", "monitor.detectors=['page_hinkley']", "--set",
+                 "plan.schedule='mape.plan.constant:Constant'", "--out", "out"]) == 0  # fmt: skip
+
+    assert modules_of(here / "out") == {}
+
+
+def test_modules_of_all_agents_of_swaps_and_of_the_system_are_kept(here: Path) -> None:
+    plan = "from mape.plan.morphin import Morphin\n\nclass Mine(Morphin):\n    pass\n"
+    levers = (
+        "import gymnasium\n"
+        "from gymnasium.spaces import Discrete\n\n"
+        "class Levers(gymnasium.Env):\n"
+        "    observation_space, action_space = Discrete(1), Discrete(3)\n\n"
+        "    def reset(self, *, seed=None, options=None):\n"
+        "        super().reset(seed=seed)\n"
+        "        return 0, {}\n\n"
+        "    def step(self, action):\n"
+        "        return 0, float(action), False, False, {}\n"
+    )
+    register = "import gymnasium\n\ngymnasium.register('OwnLevers-v0', 'own_levers:Levers', max_episode_steps=5)\n"
+    for name, text in {"own_plan": plan, "own_levers": levers, "own_worlds": register}.items():
+        (here / f"{name}.py").write_text(text)
+    (here / "several.toml").write_text(
+        'episodes = 6\nsystem = { id = "own_worlds:OwnLevers-v0" }\n'
+        '[agents.one]\nswap = [{ pass = 3, part = "plan", to = "own_plan:Mine" }]\n'
+        '[agents.two]\nmonitor = { detectors = ["own_detector:Mine"] }\n'
+    )
+
+    assert main(["compare", "several.toml", "--no-figures", "-q", "--trials", "2", "--out", "out"]) == 0
+
+    assert gymnasium.spec("OwnLevers-v0").entry_point == "own_levers:Levers"
+    assert modules_of(here / "out") == {
+        "own_detector": sha256(DETECTOR),
+        "own_levers": sha256(levers),
+        "own_plan": sha256(plan),
+        "own_worlds": sha256(register),
+    }
