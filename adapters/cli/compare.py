@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.experiments.decimals import number, resolution
 from adapters.experiments.runner import run_agents
 from adapters.experiments.statistics import Comparison, compare, holm, summary
 from mape.config import Config, overlays_of
@@ -67,7 +69,7 @@ def _configs(chosen: argparse.Namespace) -> dict[str, Config]:
         for agent in picked:
             unused.discard(str(agent))
             config = config_of(path, chosen, agent)
-            if chosen.trials is None and config.trials == 1:
+            if chosen.trials is None and "trials" not in config.model_fields_set:
                 config = config_of(path, chosen, agent, trials=DEFAULT_TRIALS)
             label = agent or config.name
             if label in found:
@@ -102,37 +104,55 @@ def _print(
 ) -> None:
     some = configs[first]
     loops = f" with {some.loops:,} loops" if some.loops > 1 else ""
-    say(
-        chosen,
-        f"{len(rows)} agents, {some.trials:,} trials{loops} of {some.episodes:,} episodes each, seeds from "
-        f"{some.seed}\n",
-    )
-    width = max(len(agent) for agent in rows)
-    say(chosen, f"{'':<{width}}{'total return':>26}{'95 % interval':>26}{'total steps':>22}{'alarms':>9}")
+    trials, episodes = _counted(some.trials, "trial"), _counted(some.episodes, "episode")
+    say(chosen, f"{len(rows)} agents, {trials}{loops} of {episodes} each, seed {some.seed}\n")
+    exact = resolution(row["total_return"]["interval"] for row in rows.values())
+    steady = resolution(row["total_steps"]["interval"] for row in rows.values())
+    lines: list[tuple[str, ...]] = [("", "total return", "95 % interval", "total steps", "alarms")]
     for agent, row in rows.items():
         total, steps = row["total_return"], row["total_steps"]
-        interval = "" if total["interval"] is None else "[{:,.0f}, {:,.0f}]".format(*total["interval"])
-        say(
-            chosen,
-            f"{agent:<{width}}{_with_sd(total):>26}{interval:>26}{_with_sd(steps):>22}{row['alarms']:>9.2f}",
-        )
-    unit = "trial" if some.loops == 1 else "loop of a trial"
+        interval = _interval(total["interval"], exact) if total["interval"] else ""
+        lines.append((agent, _with_sd(total, exact), interval, _with_sd(steps, steady), f"{row['alarms']:.2f}"))
+    _say_table(chosen, lines, (26, 26, 22, 9))
+    unit, units = ("trial", "trials") if some.loops == 1 else ("loop of a trial", "loops of a trial")
     say(chosen, f"\nagainst {first}, total return, paired by {unit}")
-    titles = f"{'difference':>14}{'95 % interval':>24}{'effect size':>13}{'Welch t':>10}{'paired p (Holm)':>17}"
-    say(chosen, f"{'':<{width}}{titles}")
+    exact = resolution(found.interval for found in against.values())
+    lines = [("", "difference", "95 % interval", "effect size", "Welch t", "paired p (Holm)")]
     for (agent, found), p in zip(against.items(), corrected, strict=True):
-        interval = "-" if found.interval is None else "[{:+,.0f}, {:+,.0f}]".format(*found.interval)
+        interval = "-" if found.interval is None else _interval(found.interval, exact, "+")
         effect = "-" if found.paired_effect is None else f"{found.paired_effect:+.2f}"
         t = "-" if found.t is None else f"{found.t:.2f}"
         said = "-" if p is None else f"{p:.2g}"
-        say(chosen, f"{agent:<{width}}{found.difference:>+14,.0f}{interval:>24}{effect:>13}{t:>10}{said:>17}")
+        lines.append((agent, number(found.difference, exact, "+"), interval, effect, t, said))
+    _say_table(chosen, lines, (14, 24, 13, 10, 17))
     say(
         chosen,
         "\nAll agents run on the same seeds: interval, effect size (mean / sd of the differences) and paired t test"
-        f"\nrest on the differences within {unit if some.loops > 1 else 'trials'}. Welch's t takes the samples as "
-        "independent.",
+        f"\nrest on the differences within {units}. Welch's t takes the samples as independent.",
     )
 
 
-def _with_sd(found: dict[str, Any]) -> str:
-    return f"{found['mean']:,.0f}" + ("" if found["sd"] is None else f" ± {found['sd']:,.0f}")
+def _say_table(chosen: argparse.Namespace, lines: Sequence[Sequence[str]], widths: Sequence[int]) -> None:
+    """Print lines of cells, the first of each to the left, the others to the right, in columns of at least `widths`."""
+    first, *others = zip(*lines, strict=True)
+    left = max(map(len, first))
+    rights = [max(width, 2 + max(map(len, column))) for width, column in zip(widths, others, strict=True)]
+    for name, *cells in lines:
+        say(chosen, f"{name:<{left}}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, rights, strict=True)))
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
+
+
+def _interval(ends: tuple[float, float], resolution: float, sign: str = "-") -> str:
+    low, high = (number(end, resolution, sign) for end in ends)
+    return f"[{low}, {high}]"
+
+
+def _with_sd(found: dict[str, Any], resolution: float) -> str:
+    mean, sd = found["mean"], found["sd"]
+    if sd is None:
+        return number(mean, resolution)
+    # Without an interval of some width the mean alone says how small a number is.
+    return f"{number(mean, resolution)} ± {number(sd, resolution or abs(mean) / 10.0)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from adapters.experiments.metrics import convergence as stages_of
+from adapters.experiments.runner import drifts_of
 from adapters.figures.comparison import Compared, comparison
 from adapters.figures.convergence import convergence
 from adapters.figures.internal_dynamics import internal_dynamics
@@ -20,6 +22,7 @@ from adapters.figures.style import save
 from adapters.results import RunFolder
 from adapters.results.files import cannot_write
 from adapters.systems import make_system
+from mape import registry
 from mape.config import Config
 
 NAMES = {
@@ -27,21 +30,24 @@ NAMES = {
     "q_learning": "Q-learning",
     "success_rule": "MORPHIN, success rule",
     "tuned_q_learning": "Q-learning, tuned",
-    "q_learning_alpha_09": "Q-learning, alpha 0.9",
-    "fixed_alpha": "fixed alpha 0.1",
-    "fixed_alpha_09": "fixed alpha 0.9",
+    "q_learning_alpha_09": "Q-learning, alpha {alpha:g}",
+    "fixed_alpha": "fixed alpha {alpha:g}",
+    "fixed_alpha_09": "fixed alpha {alpha:g}",
     "no_detector": "no detector",
     "oracle_detector": "oracle detector",
     "two_window": "two-window test",
-    "same_actions": "Q-learning, 5 actions",
-    "three_actions": "MORPHIN, 3 actions",
+    "same_actions": "Q-learning, same actions",
+    "three_actions": "MORPHIN, no new actions",
 }
+"""What agents of the examples are called in figures; numbers are taken from the config."""
+
+GRID = "mapek/Gridworld-v0"
 
 
 def pictures_of_run(folder: RunFolder, agent: str) -> list[Path]:
     """Draw the learning curve, the internal dynamics where steps were traced, and Q where the system is a grid."""
     config = folder.configs[agent]
-    made = _put(folder, _curve(folder, (agent,), window=min(50, config.episodes)), "learning_curve")
+    made = _put(folder, _curve(folder, (agent,), window=50), "learning_curve")
     if (steps := folder.trace(agent)) is not None and len(steps):
         made += _put(folder, _dynamics(folder, agent, steps), "internal_dynamics")
     if _is_grid(config):
@@ -51,8 +57,8 @@ def pictures_of_run(folder: RunFolder, agent: str) -> list[Path]:
 
 def pictures_of_table1(folder: RunFolder) -> list[Path]:
     """Draw the internal dynamics of trial 0, both agents' Q, and convergence per stage."""
-    drifts = _drifts(folder.configs["morphin"])
-    found = {_name(a): stages_of(folder.episodes(a, "q_change")["q_change"], drifts) for a in folder.configs}
+    drifts, names = drifts_of(folder.configs["morphin"]), _names(folder.configs)
+    found = {names[a]: stages_of(folder.episodes(a, "q_change")["q_change"], drifts) for a in folder.configs}
     made = _put(folder, convergence(found), "convergence")
     made += _put(folder, _heatmaps(folder, tuple(folder.configs)), "q_heatmaps")
     steps = folder.trace("morphin")
@@ -64,10 +70,12 @@ def pictures_of_table1(folder: RunFolder) -> list[Path]:
 def pictures_of_jump(folder: RunFolder) -> list[Path]:
     """Draw the agents' Q with the jumps, and the steps per episode."""
     made = _put(folder, _heatmaps(folder, tuple(folder.configs)), "q_heatmaps")
-    jump_from = folder.configs["morphin"].system.options.get("jump_from")
+    names, config = _names(folder.configs), folder.configs["morphin"]
+    jump_from, window = config.system.options.get("jump_from"), min(20, config.episodes)
     events = [int(jump_from)] if jump_from is not None else []
-    steps = {_name(agent): folder.episodes(agent, "steps")["steps"].astype(float) for agent in folder.configs}
-    figure = learning_curve(steps, drifts=events, detections={}, window=20, ylabel="steps per episode (mean of 20)")
+    steps = {names[agent]: folder.episodes(agent, "steps")["steps"].astype(float) for agent in folder.configs}
+    ylabel = f"steps per episode (mean of {window})" if window > 1 else "steps per episode"
+    figure = learning_curve(steps, drifts=events, detections={}, window=window, ylabel=ylabel)
     return made + _put(folder, figure, "steps")
 
 
@@ -80,8 +88,10 @@ def pictures_of_compare(
     folder: RunFolder, returns: Mapping[str, npt.NDArray[Any]], intervals: Mapping[str, Any]
 ) -> list[Path]:
     """Draw each agent's totals and the learning curves."""
-    table = {_name(agent): Compared(values, intervals[agent]) for agent, values in returns.items()}
-    made = _put(folder, comparison(table, xlabel="total return of a trial (units of reward)"), "comparison")
+    names = _names(folder.configs)
+    table = {names[agent]: Compared(values, intervals[agent]) for agent, values in returns.items()}
+    xlabel = f"total return of a {_unit(folder)} (units of reward)"
+    made = _put(folder, comparison(table, xlabel=xlabel), "comparison")
     episodes = min(config.episodes for config in folder.configs.values())
     return made + _put(
         folder, _curve(folder, tuple(folder.configs), window=max(1, min(500, episodes // 20))), "learning_curve"
@@ -96,37 +106,60 @@ def _put(folder: RunFolder, figure: Figure, name: str) -> list[Path]:
         raise cannot_write(target, error) from error
 
 
-def _name(agent: str) -> str:
-    return NAMES.get(agent, agent.replace("_", " "))
+def _names(configs: Mapping[str, Config]) -> dict[str, str]:
+    """Return what each agent is called in figures, which is its own name where another would be called the same."""
+    called = {agent: _name(agent, config) for agent, config in configs.items()}
+    times = Counter(called.values())
+    return {agent: name if times[name] == 1 else agent for agent, name in called.items()}
 
 
-def _drifts(config: Config) -> tuple[int, ...]:
-    system = make_system(config.system)
-    system.close()
-    return tuple(drift for drift in system.drifts if drift <= config.episodes)
+def _name(agent: str, config: Config) -> str:
+    name = NAMES.get(agent, agent.replace("_", " "))
+    if "{alpha" not in name:
+        return name
+    alpha = _fixed_alpha(config)
+    return agent if alpha is None else name.format(alpha=alpha)
+
+
+def _fixed_alpha(config: Config) -> float | None:
+    """Return the learning rate, or None where it is not one and the same in the whole run."""
+    _, options = registry.options_of("planner", config.plan, "plan")
+    alpha: float | None = getattr(options, "alpha", None)
+    return alpha if getattr(options, "alpha_max", alpha) == alpha and not config.swap else None
+
+
+def _unit(folder: RunFolder) -> str:
+    return "trial" if all(config.loops == 1 for config in folder.configs.values()) else "loop"
 
 
 def _is_grid(config: Config) -> bool:
-    return config.system.id == "mapek/Gridworld-v0"
+    return config.system.id.rpartition(":")[2] == GRID  # the module that registers it may stand in front
 
 
 def _curve(folder: RunFolder, agents: tuple[str, ...], window: int) -> Figure:
+    names = _names(folder.configs)
     curves, detections = {}, {}
     for agent in agents:
         columns = folder.episodes(agent, "return", "alarm")
-        curves[_name(agent)] = columns["return"]
+        curves[names[agent]] = columns["return"]
         if folder.configs[agent].monitor.detectors:
-            detections[_name(agent)] = (np.nonzero(columns["alarm"])[1] + 1).tolist()
-    ylabel = f"return (mean of {window} episodes)" if window > 1 else "return"
-    shared = set.intersection(*({*_drifts(folder.configs[agent])} for agent in agents))
-    return learning_curve(curves, drifts=sorted(shared), detections=detections, window=window, ylabel=ylabel)
+            detections[names[agent]] = (np.nonzero(columns["alarm"])[1] + 1).tolist()
+    window = min(window, max(folder.configs[agent].episodes for agent in agents))
+    return learning_curve(
+        curves,
+        drifts={names[agent]: drifts_of(folder.configs[agent]) for agent in agents},
+        detections=detections,
+        window=window,
+        ylabel=f"return (mean of {window} episodes)" if window > 1 else "return",
+        unit=_unit(folder),
+    )
 
 
 def _dynamics(folder: RunFolder, agent: str, steps: npt.NDArray[np.void]) -> Figure:
     columns = folder.episodes(agent, "episode", "epsilon", "return", "alarm")
     first = {name: values[0] for name, values in columns.items()}
     alarms = first["episode"][first["alarm"]].tolist()
-    drifts = _drifts(folder.configs[agent])
+    drifts = drifts_of(folder.configs[agent])
     spans = (int(steps["episode"][0]), int(steps["episode"][-1]))
     inside = (first["episode"] >= spans[0]) & (first["episode"] <= spans[1])
     return internal_dynamics(
@@ -134,12 +167,12 @@ def _dynamics(folder: RunFolder, agent: str, steps: npt.NDArray[np.void]) -> Fig
         {name: first[name][inside] for name in ("episode", "epsilon", "return")},
         alarms=[a for a in alarms if spans[0] <= a <= spans[1]],
         drifts=[d for d in drifts if spans[0] <= d <= spans[1]],
-        title=f"{_name(agent)}, trial 0",
+        title=f"{_names(folder.configs)[agent]}, {folder.configs[agent].unit_name(0, 0)}",
     )
 
 
 def _heatmaps(folder: RunFolder, agents: tuple[str, ...]) -> Figure:
-    config = folder.configs[agents[0]]
+    config, names = folder.configs[agents[0]], _names(folder.configs)
     system = make_system(config.system)
     try:
         base: Any = system.env.unwrapped
@@ -149,10 +182,16 @@ def _heatmaps(folder: RunFolder, agents: tuple[str, ...]) -> Figure:
         panels = []
         for agent in agents:
             values, actions = folder.q_table(agent, 0)
-            panels.append(Panel(_name(agent), values, actions, phase % len(base.goals)))
+            panels.append(Panel(names[agent], values, actions, phase % len(base.goals)))
         rows, columns = base.size
         return q_heatmaps(
-            panels, rows=rows, columns=columns, walls=base.walls, goals=base.goals, start=base.start, of="trial 0"
+            panels,
+            rows=rows,
+            columns=columns,
+            walls=base.walls,
+            goals=base.goals,
+            start=base.start,
+            of=config.unit_name(0, 0),
         )
     finally:
         system.close()

@@ -12,8 +12,10 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-def floats(name: str, value: object, dimensions: int, *, empty: bool = False) -> Floats:
+def floats(name: str, value: object, dimensions: int, *, empty: bool = False, gaps: bool = False) -> Floats:
     """Return `value` as a finite float64 array of that many dimensions, with at least one item unless `empty`.
+
+    With `gaps` there may be NaN beside at least one number: what was not recorded.
 
     Raises
     ------
@@ -32,8 +34,9 @@ def floats(name: str, value: object, dimensions: int, *, empty: bool = False) ->
         raise ValueError(f"{name} has shape {found.shape}; give an array of {dimensions} dimension(s)")
     if found.size == 0:
         raise ValueError(f"{name} is empty, shape {found.shape}; there is nothing to draw without at least one item")
-    if not np.isfinite(found).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(found))[0])
+    wrong = np.isinf(found) if gaps and not np.isnan(found).all() else ~np.isfinite(found)
+    if wrong.any():
+        where = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise ValueError(f"{name} holds {found[where]} at {where}; give finite numbers")
     return found
 

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
+from adapters.experiments import decimals
 from adapters.figures import arrays, style
 
 
@@ -50,16 +52,15 @@ def comparison(table: Mapping[str, Compared], *, xlabel: str) -> Figure:
     axes = figure.subplots()
     style.dress(axes, xlabel=xlabel, grid="x")
     data = {name: _checked(name, compared) for name, compared in table.items()}
-    widths = [high - low for _, interval in data.values() if interval is not None for low, high in [interval]]
-    resolution = min((width / 2.0 for width in widths if width > 0.0), default=0.0)
+    resolution = decimals.resolution(interval for _, interval in data.values())
     lowest, highest = np.inf, -np.inf
+    texts = []
     for row, (values, interval) in enumerate(data.values()):
         mean = float(values.mean())
         shade = style.colour(row)
-        spread = (np.arange(len(values)) * 0.6180339887498949) % 1.0 - 0.5
         axes.plot(
             np.sort(values),
-            row + 0.56 * spread,
+            row + 0.56 * style.spread(len(values)),
             linestyle="none",
             marker="o",
             markersize=2.2,
@@ -97,20 +98,39 @@ def comparison(table: Mapping[str, Compared], *, xlabel: str) -> Figure:
             zorder=4.0,
             gid="mean",
         )
-        style.write(axes, 1.02, row, text, transform=axes.get_yaxis_transform(), va="center")
+        texts.append(style.write(axes, 1.02, row, text, transform=axes.get_yaxis_transform(), va="center"))
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
     margin = 0.04 * (highest - lowest) or 0.05 * abs(highest) or 0.5
     axes.set_xlim(lowest - margin, highest + margin)
     axes.set_ylim(len(table) - 0.5, -0.5)
-    axes.set_yticks(range(len(table)), [style.shorten(name) for name in table])
-    for label in axes.get_yticklabels():
+    axes.set_yticks(range(len(table)), list(style.short_names(table).values()))
+    names = axes.get_yticklabels()
+    for label in names:
         label.set_parse_math(False)
     axes.tick_params(axis="y", length=0.0)
     axes.spines["left"].set_visible(False)
-    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
-    if highest - lowest + 2.0 * margin > 20.0:
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    few_digits = highest - lowest + 2.0 * margin > 20.0 and max(abs(lowest), abs(highest)) < 1e9
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}") if few_digits else style.PlainTicks())
+    beside = max(map(style.width, names)) + max(map(style.width, texts))
+    _ticks(axes, figure.get_figwidth() - beside - 0.3)
     return figure
+
+
+def _ticks(axes: Axes, width: float) -> None:
+    """Set at most six ticks, and as many as have room for their labels on an axis of that width, in inches."""
+    low, high = axes.get_xlim()
+    probe = style.write(axes, low, 0.0, "")
+    for most in range(6, 0, -1):
+        locator = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10])
+        axes.xaxis.set_major_locator(locator)
+        ticks = [tick for tick in locator.tick_values(low, high) if low <= tick <= high]
+        needed = 0.0
+        for label in axes.xaxis.get_major_formatter().format_ticks(ticks):
+            probe.set_text(label)
+            needed = max(needed, style.width(probe) + 0.12)
+        if len(ticks) < 2 or needed <= (ticks[1] - ticks[0]) / (high - low) * width:
+            break
+    probe.remove()
 
 
 def _checked(name: str, compared: Compared) -> tuple[arrays.Floats, tuple[float, float] | None]:

@@ -95,6 +95,7 @@ def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
             fontsize=7.0,
             gid="none converged",
         )
+    above.yaxis.set_major_formatter(style.PlainTicks())
     above.yaxis.set_major_locator(MaxNLocator(6, integer=True, steps=[1, 2, 5, 10]))
     above.tick_params(axis="x", length=0.0)
     below.set_xlim(-0.5, n_stages - 0.5)
@@ -102,7 +103,8 @@ def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
     below.set_ylim(0.0, 1.32)
     below.set_yticks([0.0, 1.0], ["0 %", "100 %"])
     entries: list[tuple[Any, str]] = [
-        (Patch(facecolor=style.colour(i), edgecolor="none"), style.shorten(name)) for i, name in enumerate(data)
+        (Patch(facecolor=style.colour(i), edgecolor="none"), name)
+        for i, name in enumerate(style.short_names(data).values())
     ]
     style.legend(
         figure,
@@ -130,12 +132,10 @@ def _checked(name: str, found: list[ConvergedStage]) -> list[tuple[Ints, int]]:
 
 
 def _distribution(axes: Axes, x: float, pitch: float, converged: Ints, shade: str) -> None:
-    # Dots beside the box, spread by a sequence that fills the width evenly and is the same each time.
-    spread = (np.arange(len(converged)) * 0.6180339887498949) % 1.0 - 0.5
     boxed = len(converged) >= BOX_FROM
     middle, width = (x + 0.22 * pitch, 0.3 * pitch) if boxed else (x, 0.3 * pitch)
     axes.plot(
-        middle + width * spread,
+        middle + width * style.spread(len(converged)),  # beside the box
         np.sort(converged),
         linestyle="none",
         marker="o",

@@ -27,8 +27,6 @@ def internal_dynamics(
     alarms: Sequence[int],
     drifts: Sequence[int],
     title: str = "",
-    first: int | None = None,
-    last: int | None = None,
 ) -> Figure:
     """Draw return, Q of the chosen pairs, epsilon and alpha* over the learning steps of one trial.
 
@@ -44,15 +42,13 @@ def internal_dynamics(
         units of return), `alpha` (step size of the update, alpha*). Other columns are not used.
     episodes
         One item per episode, in the same form, shape (episodes,): `episode`, `epsilon`, `return`. It covers at least
-        the episodes shown.
+        those of the trace.
     alarms
         Episodes at whose end a detector alarmed.
     drifts
         Episodes from which a new regime held.
     title
         Text above the figure.
-    first, last
-        Episodes shown, both included; by default all of the trace.
 
     Returns
     -------
@@ -61,28 +57,20 @@ def internal_dynamics(
     Raises
     ------
     ValueError
-        A column is missing, of another length, empty or not finite, an episode shown has no steps, or no episode is
-        left to show.
+        A column is missing, of another length, empty or not finite, or an episode has no steps.
     """
     trace = arrays.columns("steps", steps, ("episode", "exploratory", "q", "alpha"))
     table = arrays.columns("episodes", episodes, ("episode", "epsilon", "return"))
     of_step = arrays.integers("steps['episode']", trace["episode"])
     if not np.isin(np.diff(of_step), (0, 1)).all():
         raise ValueError("steps['episode'] goes back or leaves out an episode; give the steps of a run in their order")
-    first = int(of_step[0]) if first is None else arrays.count("first", first)
-    last = int(of_step[-1]) if last is None else arrays.count("last", last)
-    if not of_step[0] <= first <= last <= of_step[-1]:
-        raise ValueError(
-            f"first and last are {first} and {last}; give episodes in {of_step[0]}..{of_step[-1]}, which the trace "
-            "covers, first not after last"
-        )
+    first, last = int(of_step[0]), int(of_step[-1])
     rows = _rows_of(arrays.integers("episodes['episode']", table["episode"]), first, last)
 
     shown = np.arange(first, last + 2)
     # Step n, from 1, lies between n - 1 and n; an episode begins where the one before it ends.
     begins = np.searchsorted(of_step, shown).astype(np.float64)
-    inside = slice(int(begins[0]), int(begins[-1]))
-    x = np.arange(inside.start, inside.stop, dtype=np.float64) + 0.5
+    x = np.arange(len(of_step), dtype=np.float64) + 0.5
     drift_x = begins[[d - first for d in arrays.integers("drifts", drifts, empty=True).tolist() if first <= d <= last]]
     alarm_x = begins[
         [a - first + 1 for a in arrays.integers("alarms", alarms, empty=True).tolist() if first <= a <= last]
@@ -93,23 +81,23 @@ def internal_dynamics(
         figure.subplots(4, 1, sharex=True, gridspec_kw={"height_ratios": [1.1, 2.4, 0.8, 1.1], "hspace": 0.0})
     )
     figure.align_ylabels(panels)
-    start = int(of_step[0])
-    below = "learning step" if start == 1 else f"learning step since the start of episode {start}"
+    below = "learning step" if first == 1 else f"learning step since the start of episode {first}"
     for axes, ylabel in zip(panels, ("return", "Q(s, a)\nof the chosen pair", "ε", f"{ALPHA}*"), strict=True):
         style.dress(axes, ylabel=ylabel, xlabel=below if axes is panels[-1] else "")
         style.mark_drifts(axes, drift_x)
         style.mark_alarms(axes, alarm_x)
+        axes.yaxis.set_major_formatter(style.PlainTicks())
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
     panels[0].set_xlim(begins[0], begins[-1])
     panels[-1].xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
 
     panels[0].stairs(table["return"][rows], begins, baseline=None, color=style.INK, linewidth=0.6)
-    exploratory = trace["exploratory"][inside] != 0
-    _dots(panels[1], x, trace["q"][inside], exploratory)
+    exploratory = trace["exploratory"] != 0
+    _dots(panels[1], x, trace["q"], exploratory)
     panels[2].stairs(table["epsilon"][rows], begins, baseline=None, color=style.INK, linewidth=0.9)
     panels[2].set_ylim(-0.06, 1.06)
     panels[2].set_yticks([0.0, 0.5, 1.0])
-    _dots(panels[3], x, trace["alpha"][inside], exploratory)
+    _dots(panels[3], x, trace["alpha"], exploratory)
 
     _number_episodes(panels[0], shown[:-1], begins, drift_x)
     if title:
@@ -134,9 +122,7 @@ def _rows_of(numbers: Ints, first: int, last: int) -> Ints:
     missing = at == len(numbers)
     missing[~missing] = numbers[order][at[~missing]] != wanted[~missing]
     if missing.any():
-        raise ValueError(
-            f"episodes['episode'] has no {wanted[missing][0]}; give all of the episodes shown, {first}..{last}"
-        )
+        raise ValueError(f"episodes['episode'] has no {wanted[missing][0]}; give all of the trace, {first}..{last}")
     return np.asarray(order[at], dtype=np.int64)
 
 
@@ -169,12 +155,11 @@ def _number_episodes(axes: Axes, episodes: Ints, begins: Floats, drift_x: Floats
     round_ones = [
         tick for bins in (6, 20, 60) for tick in MaxNLocator(bins, integer=True, steps=[1, 2, 5, 10]).tick_values(*ends)
     ]
-    places = [float(x) for x in drift_x]
-    for episode in (episodes[0], *round_ones):
-        if not episodes[0] <= episode <= episodes[-1]:
-            continue
-        x = float(begins[int(episode) - int(episodes[0])])
-        if all(abs(x - other) > 0.07 * span for other in places):
+    others = [begins[int(e) - int(episodes[0])] for e in (episodes[0], *round_ones) if episodes[0] <= e <= episodes[-1]]
+    apart = max(0.07, 0.012 * len(f"{episodes[-1]:,}")) * span
+    places: list[float] = []
+    for x in map(float, (*drift_x, *others)):
+        if all(abs(x - other) > apart for other in places):
             places.append(x)
     places.sort()
     top = axes.secondary_xaxis("top")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -26,6 +28,8 @@ DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 """Rows and columns by which actions 0 to 3 move: up, down, left, right; 4 to 7 are jumps the same ways."""
 
 PER_ROW = 4
+HIGHEST, LOWEST = 6.0, 0.9
+"""Heights of a heatmap in inches: none is higher, and beside a lower one a scale has no room."""
 GOAL, UNKNOWN, WALL = "#D55E00", "#ececec", "#fafafa"
 
 # Outlines of an arrow to the right, its middle at (0, 0); only the half above the axis, from tail to tip.
@@ -69,7 +73,7 @@ def q_heatmaps(
     Parameters
     ----------
     panels
-        What is shown, from left to right, at most four in a row.
+        What is shown, from left to right, at most four in a row; fewer of grids that are broad.
     rows, columns
         Size of the grid.
     walls, goals
@@ -101,11 +105,19 @@ def q_heatmaps(
     ordinary[[row * columns + column for row, column in wall_cells + goal_cells]] = False
     norm = _norm(np.concatenate([b[k & ordinary] for b, k in zip(best, known, strict=True)]))
 
-    down = -(-len(panels) // PER_ROW)
+    per_row = max(1, min(PER_ROW, 2 * PER_ROW * rows // columns))
+    down = -(-len(panels) // per_row)
     across = -(-len(panels) // down)
-    width = style.COLUMN if len(panels) == 1 else style.PAGE
+    broad = columns > 2 * rows
+    width = style.PAGE if broad or len(panels) > 1 else style.COLUMN
     side = (width - 0.9) / across - 0.15
-    figure = style.new_figure(width, down * (min(side, 3.0) * rows / columns + 0.42) + 0.4)
+    # A high map is narrower than its place, as the layout knows what is beside a map only where there is room for it.
+    most = side if broad else min(side, 3.0) - (0.4 if rows > 1.5 * columns else 0.0)
+    high = min(most * rows / columns, HIGHEST)
+    flat = high < LOWEST
+    titles = [style.two_lines(panel.title, 30 if across < PER_ROW else 22) for panel in panels]
+    above = sum(0.14 for i in range(down) if any("\n" in title for title in titles[i * across : (i + 1) * across]))
+    figure = style.new_figure(width, down * (high + 0.42) + above + (1.1 if flat else 0.4))
     grid = figure.subplots(down, across, squeeze=False)
     everything: list[Axes] = list(grid.flat)
     jumping = False
@@ -115,8 +127,10 @@ def q_heatmaps(
             continue
         panel = panels[i]
         image = np.ma.masked_array(best[i], ~known[i]).reshape(rows, columns)
-        _cells(axes, image, norm)
-        style.headline(axes, style.two_lines(panel.title, 30 if across < PER_ROW else 22))
+        _cells(axes, image, norm, high / rows)
+        if rows > 2 * columns:
+            axes.set_anchor("W")  # a title may be broader than the map, and begins with it
+        style.headline(axes, titles[i])
         _mark(axes, wall_cells, goal_cells, panel.active_goal, start_cell)
         at_goal = np.zeros(rows * columns, dtype=bool)
         if goal_cells:
@@ -126,17 +140,11 @@ def q_heatmaps(
         _arrows(axes, greedy, best[i], columns, norm)
         jumping = jumping or bool((greedy >= 4).any())
     over = any((norm(b[k]) > 1.0).any() for b, k in zip(best, known, strict=True))
-    # Inside the last panel's frame, the bar is exactly as high as the panels.
-    place = everything[across - 1].inset_axes((1.04, 0.0, 0.045, 1.0))
-    bar = figure.colorbar(everything[0].images[0], cax=place, extend="max" if over else "neither")
-    bar.ax.tick_params(labelsize=style.SMALL, labelfontfamily=style.FAMILY, width=0.6, length=2.5, color=style.MUTED)
-    bar.ax.yaxis.set_major_locator(MaxNLocator(5))
-    bar.outline.set_linewidth(0.4)
-    bar.set_label(
-        "maxₐ Q(s, a)" + (f", {of}" if of else ""), fontsize=style.NORMAL, family=style.FAMILY, color=style.INK
-    )
+    share = side / (high * columns / rows)
+    bar = _scale(figure, everything, across, None if flat else share, "max" if over else "neither", of)
+    bar.long_axis.set_major_locator(MaxNLocator(5 if flat or high > 1.3 else 3))
     unseen = any((~k & ordinary).any() for k in known)
-    _legend(figure, len(panels), jumping, unseen, wall_cells, goal_cells, start_cell)
+    _legend(figure, width > style.COLUMN, jumping, unseen, wall_cells, goal_cells, start_cell)
     return figure
 
 
@@ -160,7 +168,8 @@ def _norm(values: Floats) -> Normalize:
     return Normalize(low, high) if low < high else Normalize(low - 0.5, high + 0.5)
 
 
-def _cells(axes: Axes, image: Any, norm: Normalize) -> None:
+def _cells(axes: Axes, image: Any, norm: Normalize, side: float) -> None:
+    """Draw the values, in cells whose sides have about that many inches."""
     rows, columns = image.shape
     style.dress(axes, grid="none")
     axes.set_facecolor(UNKNOWN)
@@ -168,7 +177,7 @@ def _cells(axes: Axes, image: Any, norm: Normalize) -> None:
     axes.set_xlim(-0.5, columns - 0.5)
     axes.set_ylim(rows - 0.5, -0.5)
     for axis, length in ((axes.xaxis, columns), (axes.yaxis, rows)):
-        step = max(1, -(-(length - 1) // 4))
+        step = max(1, -(-(length - 1) // 4), ceil(0.14 / side))
         axis.set_ticks(range(0, length, step))
     axes.tick_params(length=0.0)
     for spine in axes.spines.values():
@@ -238,7 +247,31 @@ def _points_per_cell(axes: Axes) -> float:
     # Before the layout is made an axes has about its final width.
     figure = axes.get_figure(root=True)
     assert figure is not None
-    return float(72.0 * figure.get_figwidth() * axes.get_position().width / (axes.get_xlim()[1] - axes.get_xlim()[0]))
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    broad = float(72.0 * figure.get_figwidth() * axes.get_position().width / (right - left))
+    return min(broad, 72.0 * HIGHEST / (bottom - top))
+
+
+def _scale(
+    figure: Figure, everything: Sequence[Axes], across: int, share: float | None, extend: str, of: str
+) -> Colorbar:
+    """Draw the scale of colour beside the last heatmap of the first row, or below all where `share` is None.
+
+    `share` is 1 where a heatmap is as broad as its place, and more where it is narrower.
+    """
+    image = everything[0].images[0]
+    if share is None:
+        bar = figure.colorbar(image, ax=list(everything), location="bottom", extend=extend, aspect=40.0, pad=0.06)
+    else:
+        # Inside the last panel's frame, the bar is exactly as high as the panels.
+        place = everything[across - 1].inset_axes((1.0 + 0.04 * share, 0.0, 0.045 * share, 1.0))
+        bar = figure.colorbar(image, cax=place, extend=extend)
+    bar.ax.tick_params(labelsize=style.SMALL, labelfontfamily=style.FAMILY, width=0.6, length=2.5, color=style.MUTED)
+    bar.long_axis.set_major_formatter(style.PlainTicks())
+    bar.outline.set_linewidth(0.4)
+    label = "maxₐ Q(s, a)" + (f", {of}" if of else "")
+    bar.set_label(label, fontsize=style.NORMAL, family=style.FAMILY, color=style.INK)
+    return bar
 
 
 def _arrows(axes: Axes, greedy: Ints, best: Floats, columns: int, norm: Normalize) -> None:
@@ -267,7 +300,7 @@ def _whole(outline: tuple[tuple[float, float], ...]) -> Floats:
 
 def _legend(
     figure: Figure,
-    panels: int,
+    broad: bool,
     jumping: bool,
     unseen: bool,
     walls: Sequence[Cell],
@@ -305,5 +338,5 @@ def _legend(
     if unseen:
         entries.append((Patch(facecolor=UNKNOWN, edgecolor="none"), "never updated"))
     if entries:
-        across = min(len(entries), 6) if panels > 1 else 2 if len(entries) == 4 else 3
+        across = min(len(entries), 6) if broad else 2 if len(entries) == 4 else 3
         style.legend(figure, entries, loc="outside lower center", ncols=across, handleheight=1.1, handlelength=1.3)

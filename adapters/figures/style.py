@@ -8,25 +8,30 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
 import os
+import re
 import secrets
 import textwrap
 import threading
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 import numpy.typing as npt
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
+from matplotlib.ticker import ScalarFormatter
+from matplotlib.transforms import Transform
+
+from adapters.experiments import decimals
 
 COLUMN, PAGE = 3.5, 7.2
 """Width of a column and of a page, in inches."""
@@ -35,6 +40,7 @@ SMALL, NORMAL = 8.0, 9.0
 """Sizes of text in points: ticks and legends, labels and titles."""
 
 FAMILY = "DejaVu Sans"  # comes with matplotlib, so a figure has the same bytes on every machine
+MINUS = "\N{MINUS SIGN}"
 INK, MUTED, GRID, BAND = "#222222", "#666666", "#e4e4e4", "#c4c4c4"
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -42,6 +48,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1.5, 1, 1.5)))
 """Line styles, so that neighbours differ in greyscale too."""
+
+ROWS = 3
+"""Rows of a legend for which a figure has room."""
 
 PNG_DPI, RASTER_DPI = 200, 400
 
@@ -51,6 +60,14 @@ _saving = threading.Lock()
 def colour(index: int) -> str:
     """Return the colour of the agent at `index` of its figure."""
     return COLOURS[index % len(COLOURS)]
+
+
+def spread(count: int) -> npt.NDArray[np.float64]:
+    """Return places in [-0.5, 0.5), shape (count,), over which dots of equal value are spread beside one another.
+
+    Multiples of the golden ratio: they fill the width evenly however many they are, and are the same each time.
+    """
+    return np.asarray((np.arange(count) * 0.6180339887498949) % 1.0 - 0.5, dtype=np.float64)
 
 
 def dashes(index: int) -> Any:
@@ -93,14 +110,64 @@ def headline(axes: Axes, text: str) -> None:
         axes.set_title(text, fontsize=NORMAL, family=FAMILY, color=INK, loc="left", pad=5.0, parse_math=False)
 
 
-def write(axes: Axes, x: float, y: float, text: str, **options: Any) -> Artist:
+def write(axes: Axes, x: float, y: float, text: str, **options: Any) -> Text:
     """Write small text into axes; `options` are those of `Axes.text`."""
     settings: dict[str, Any] = {"fontsize": SMALL, "family": FAMILY, "color": INK, "parse_math": False}
     return axes.text(x, y, text, **(settings | options))
 
 
-def legend(owner: Axes | Figure, entries: Sequence[tuple[Any, str]], **options: Any) -> Legend:
-    """Add a frameless legend; unlike matplotlib's own, it takes any text as a name, also one with an underscore."""
+class PlainTicks(ScalarFormatter):
+    """Numbers at ticks, each whole: the power of ten that matplotlib sets apart would lie on what stands there."""
+
+    def __init__(self) -> None:
+        super().__init__(useOffset=False)
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the text of a tick."""
+        if not super().get_offset():
+            return str(super().__call__(x, pos))
+        return re.sub(r"e\+?(-?)0*", r"e\1", f"{x:.6g}").replace("-", MINUS)
+
+    def get_offset(self) -> str:
+        """Return nothing."""
+        return ""
+
+
+def renderer(figure: Figure) -> RendererAgg:
+    """Return what can tell how large an artist of `figure` will be."""
+    canvas = figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    found: RendererAgg = canvas.get_renderer()  # type: ignore[no-untyped-call]
+    return found
+
+
+def width(text: Text) -> float:
+    """Return the width of a text in inches."""
+    figure = text.get_figure(root=True)
+    assert isinstance(figure, Figure)
+    return float(text.get_window_extent(renderer(figure)).width / figure.dpi)
+
+
+def legend(figure: Figure, entries: Sequence[tuple[Any, str]], *, ncols: int, **options: Any) -> Legend:
+    """Add a frameless legend of at most `ncols` columns, of fewer where they would be wider than the figure.
+
+    Unlike matplotlib's own, it takes any text as a name, also one with an underscore. Where it has more than `ROWS`
+    rows, the figure becomes higher by the others.
+    """
+    while True:
+        made = _legend(figure, entries, ncols=ncols, **options)
+        extent = made.get_window_extent(renderer(figure))
+        if ncols == 1 or extent.width <= figure.bbox.width:
+            break
+        made.remove()
+        ncols -= 1
+    rows = -(-len(entries) // ncols)
+    if rows > ROWS:
+        figure.set_figheight(figure.get_figheight() + extent.height / figure.dpi * (rows - ROWS) / rows)
+    return made
+
+
+def _legend(owner: Figure, entries: Sequence[tuple[Any, str]], **options: Any) -> Legend:
     settings: dict[str, Any] = {
         "prop": {"family": FAMILY, "size": SMALL},
         "frameon": False,
@@ -126,6 +193,22 @@ def shorten(name: str, length: int = 26) -> str:
     return name if len(name) <= length else name[: length - 1] + "…"
 
 
+def short_names(names: Iterable[str], length: int = 26) -> dict[str, str]:
+    """Return names, cut where they would not fit, by the whole ones; different names stay different.
+
+    Names of one beginning lose their middle, and those that differ only there are not cut.
+
+    >>> short_names(["a_long_name", "a_long_name_too", "another_long_name"], 10)
+    {'a_long_name': 'a_lo…_name', 'a_long_name_too': 'a_lo…e_too', 'another_long_name': 'another_l…'}
+    """
+    found = {name: shorten(name, length) for name in names}
+    head, tail = length // 2 - 1, length - length // 2
+    for cut in (lambda name: f"{name[:head]}…{name[-tail:]}", lambda name: name):
+        times = Counter(found.values())
+        found = {name: cut(name) if times[short] > 1 and len(name) > length else short for name, short in found.items()}
+    return found
+
+
 def two_lines(name: str, length: int) -> str:
     r"""Break a name into two lines of at most `length` letters, and cut what does not fit into them.
 
@@ -138,12 +221,19 @@ def two_lines(name: str, length: int) -> str:
 
 def mark_drifts(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64]) -> LineCollection:
     """Mark true drifts: broad light bands behind the data, one per x in `at`."""
-    return _verticals(axes, at, "drift", colors=BAND, linewidths=2.6, zorder=0.8)
+    return _verticals(axes, at, "drift", axes.get_xaxis_transform(), colors=BAND, linewidths=2.6, zorder=0.8)
+
+
+def mark_drifts_of_row(axes: Axes, at: Sequence[float], row: int, name: str) -> LineCollection:
+    """Mark true drifts that only one agent meets, within its row of a strip."""
+    ends, gid = (row - 0.5, row + 0.5), f"drift of {name}"
+    return _verticals(axes, at, gid, axes.transData, ends, colors=BAND, linewidths=2.6, zorder=0.8)
 
 
 def mark_alarms(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64]) -> LineCollection:
     """Mark alarms: thin dashed dark lines over the data, one per x in `at`."""
-    return _verticals(axes, at, "alarm", colors=INK, linewidths=0.7, linestyles=[(0, (3.0, 1.6))], zorder=3.0)
+    across = axes.get_xaxis_transform()
+    return _verticals(axes, at, "alarm", across, colors=INK, linewidths=0.7, linestyles=[(0, (3.0, 1.6))], zorder=3.0)
 
 
 def drift_handle() -> Line2D:
@@ -156,8 +246,15 @@ def alarm_handle() -> Line2D:
     return Line2D([], [], color=INK, linewidth=0.7, linestyle=(0, (3.0, 1.6)))
 
 
-def _verticals(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64], gid: str, **options: Any) -> LineCollection:
-    lines = LineCollection([[(x, 0.0), (x, 1.0)] for x in at], transform=axes.get_xaxis_transform(), **options)
+def _verticals(
+    axes: Axes,
+    at: Sequence[float] | npt.NDArray[np.float64],
+    gid: str,
+    transform: Transform,
+    ends: tuple[float, float] = (0.0, 1.0),
+    **options: Any,
+) -> LineCollection:
+    lines = LineCollection([[(x, ends[0]), (x, ends[1])] for x in at], transform=transform, **options)
     lines.set_gid(gid)
     lines.set_capstyle("butt")
     axes.add_collection(lines, autolim=False)
@@ -165,14 +262,12 @@ def _verticals(axes: Axes, at: Sequence[float] | npt.NDArray[np.float64], gid: s
 
 
 def number(value: float, resolution: float) -> str:
-    """Write a number with thousands separated and as many decimals as `resolution` calls for.
+    """Write a number as `adapters.experiments.decimals.number` does, with the minus sign of figures.
 
-    >>> number(23348.123, 90.0), number(-340.26, 0.8), number(5.9, 0.0)
-    ('23,348', '−340.3', '5.9')
+    >>> number(23348.123, 90.0), number(-340.26, 0.8)
+    ('23,348', '−340.3')
     """
-    size = resolution if resolution > 0.0 else abs(value) / 10.0
-    decimals = 0 if size == 0.0 else min(6, max(0, -math.floor(math.log10(size))))
-    return f"{value:,.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+    return decimals.number(value, resolution).replace("-", MINUS)
 
 
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:

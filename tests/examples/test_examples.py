@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from adapters.cli.main import parser
+from adapters.cli.options import parser
 from adapters.results import read_episodes
 from adapters.systems import make_system
 from knowledge import from_json

@@ -16,6 +16,7 @@ from adapters.figures import (
     q_heatmaps,
 )
 from adapters.figures.learning_curve import summarise
+from adapters.figures.style import save
 
 
 class Stage(NamedTuple):
@@ -71,11 +72,11 @@ def test_a_drift_stands_before_its_episode_and_an_alarm_after_it_in_every_panel(
     assert alarms[0].get_linestyles()[0][1] is not None
 
 
-def test_a_window_of_episodes_shows_their_steps_at_their_own_places():
-    steps, episodes = trace([4, 3, 5, 2])
-    figure = internal_dynamics(steps, episodes, alarms=[1, 4], drifts=[2, 4], first=2, last=3)
-    assert figure.axes[0].get_xlim() == (4.0, 12.0)
-    assert xs(by_gid(figure, "drift")[0]) == [4.0]
+def test_a_trace_of_some_episodes_shows_what_happened_in_them():
+    steps, episodes = trace([3, 5], first=2)
+    figure = internal_dynamics(steps, episodes, alarms=[1, 4], drifts=[2, 4])
+    assert figure.axes[0].get_xlim() == (0.0, 8.0)
+    assert xs(by_gid(figure, "drift")[0]) == [0.0]
     assert xs(by_gid(figure, "alarm")[0]) == []
     assert sum(len(line.get_xdata()) for line in figure.axes[1].lines) == 8
 
@@ -106,8 +107,6 @@ def test_a_structured_array_serves_as_well_as_a_mapping():
         ({"q": np.zeros(3)}, "columns of one length"),
         ({"q": np.array([0.0, np.nan, 0.0, 0.0])}, r"holds nan at \(1,\)"),
         ({"episode": np.array([1, 1, 3, 3])}, "leaves out an episode"),
-        ({"first": 2, "last": 1}, "first not after last"),
-        ({"last": 9}, "give episodes in 1..2"),
         ({"drifts": [0]}, "drifts holds 0"),
         ({"episodes": {"episode": [1], "epsilon": [0.1], "return": [0.0]}}, "has no 2"),
     ],
@@ -278,6 +277,28 @@ def test_a_long_curve_is_thinned_but_keeps_its_ends_and_the_drift():
     curve = summarise(np.zeros((2, 10_001)), 500, keep=[3001])
     assert len(curve.episodes) <= 1502
     assert {1, 3000, 3001, 10_001} <= set(curve.episodes.tolist())
+
+
+def test_episodes_without_a_record_count_in_no_mean():
+    nan = np.nan
+    curve = summarise(np.array([[1.0, nan, 3.0, nan, nan, 6.0]]), window=2)
+    np.testing.assert_array_equal(curve.mean, [1.0, 1.0, 3.0, 3.0, nan, 6.0])
+    curve = summarise(np.array([[1.0, nan, nan, 4.0], [3.0, 5.0, nan, 6.0]]), window=1)
+    np.testing.assert_array_equal(curve.mean, [2.0, 5.0, nan, 5.0])
+    np.testing.assert_array_equal(np.isnan(curve.low), [False, True, True, False])
+
+
+def test_a_run_with_dropped_episodes_is_drawn_and_one_without_any_record_is_not(tmp_path):
+    def drawn(values):
+        return learning_curve({"a": values}, drifts=[], detections={}, window=2, ylabel="return")
+
+    values = np.arange(40.0).reshape(2, 20)
+    values[0, 3:9] = values[1, 5:12] = np.nan
+    save(drawn(values), tmp_path, "curve")
+    with pytest.raises(ValueError, match="holds nan at"):
+        drawn(np.full((1, 3), np.nan))
+    with pytest.raises(ValueError, match="holds inf at"):
+        drawn([[1.0, np.inf]])
 
 
 def test_drifts_and_alarms_stand_at_their_episodes():

@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -6,7 +7,7 @@ from mape_runs import GRID
 
 from mape.config import Config, SwapConfig, from_table, load, overlays_of, parts_of
 from mape.errors import ConfigError, UnknownName
-from mape.tables import merge, parse_override
+from mape.tables import NOTHING, first_difference, merge, parse_override
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -87,6 +88,19 @@ def test_a_table_that_names_no_other_part_is_merged(file):
     assert load(file(RUN), agent="decay").plan.options == {"alpha": 0.2}
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "found"),
+    [
+        ({"a": {"b": None}}, {"a": {}}, ("a.b", None, NOTHING)),
+        ({"a": {}}, {"a": {"b": None}}, ("a.b", NOTHING, None)),
+        ({"a": 1, "b": {"c": 2}}, {"a": 1}, ("b", {"c": 2}, NOTHING)),
+        ({"a": {"b": [1, 2]}, "c": 3}, {"a": {"b": [1, 3]}, "c": 4}, ("a.b", [1, 2], [1, 3])),
+    ],
+)
+def test_the_first_difference_of_two_tables_is_named_where_one_has_nothing_too(one, other, found):
+    assert first_difference(one, other) == found
+
+
 def test_merging_changes_neither_table():
     base, over = {"a": {"b": 1}, "c": [1]}, {"a": {"d": 2}, "c": [2]}
     assert merge(base, over) == {"a": {"b": 1, "d": 2}, "c": [2]}
@@ -141,6 +155,46 @@ def test_a_file_of_json_is_read_too(file):
 def test_a_file_that_cannot_be_read_as_a_config_says_why(file, text, name, reason):
     with pytest.raises(ConfigError, match=reason):
         load(file(text, name))
+
+
+@pytest.mark.parametrize("depth", [250, 600, 3000])
+def test_what_is_nested_deeper_than_can_be_read_is_refused(file, depth):
+    lists = "[" * depth + "]" * depth
+    for name, text in (
+        ("run.toml", f'episodes = 5\nsystem = {{ id = "x", options = {{ a = {lists} }} }}'),
+        ("run.json", f'{{"episodes": 5, "system": {{"id": "x", "options": {{"a": {lists}}}}}}}'),
+    ):
+        with pytest.raises(ConfigError, match="holds tables or lists within one another"):
+            load(file(text, name))
+    for override in (f"system.options.a={lists}", "system.options" + ".a" * depth + "=1"):
+        with pytest.raises(ConfigError, match="holds tables or lists within one another"):
+            load(file(RUN), overrides=[override])
+
+
+def test_overlays_of_what_is_nested_too_deeply_are_refused(file):
+    with pytest.raises(ConfigError, match=r"run\.toml holds tables or lists within one another"):
+        overlays_of(file("a = " + "[" * 3000 + "]" * 3000), "agent")
+
+
+@pytest.mark.parametrize("kind", ["profile", "agent"])
+@pytest.mark.parametrize("value", ["3", "true", '"morphin"', "[1]"])
+def test_overlays_that_are_no_table_of_tables_are_refused(file, kind, value):
+    path = file(f"episodes = 5\n{kind}s = {value}\n")
+    with pytest.raises(ConfigError, match=rf"{kind}s is a table of tables, \[{kind}s\.NAME\]"):
+        overlays_of(path, kind)
+
+
+def test_what_is_wrong_says_which_profile_and_agent_are_laid_over(file):
+    path = file(RUN + "[agents.wrong.plan]\nbogus = 1\n")
+    for chosen, said in (
+        ({"agent": "wrong"}, f"{path}, agent wrong: plan.bogus: no such option"),
+        ({"agent": "wrong", "profile": "fast"}, f"{path}, profile fast, agent wrong: plan.bogus: no such option"),
+        ({"agent": "decay", "overrides": ["plan.bogus=2"]}, f"{path}, agent decay: plan.bogus: no such option"),
+        ({"overrides": ["episodes=0"]}, f"{path}: episodes: "),
+        ({"agent": "decay", "overrides": ["episodes=0"]}, f"{path}, agent decay: episodes: "),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            load(path, **chosen)
 
 
 def test_a_missing_file_points_to_the_examples(tmp_path):
@@ -251,6 +305,32 @@ def test_a_value_of_the_wrong_type_or_size_is_refused_and_not_converted(table, w
 def test_a_number_that_is_not_finite_is_refused(table, bad):
     with pytest.raises(ConfigError, match="finite"):
         from_table(table(bad))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize(
+    ("table", "named"),
+    [
+        (lambda bad: changed(system={"options": {"goal_reward": bad}}), "system.options.goal_reward"),
+        (lambda bad: changed(system={"options": {"of": [1, {"x": bad}]}}), "system.options.of[1].x"),
+        (
+            lambda bad: changed(monitor={"detectors": [{"name": "swap_detector:Failures", "floor": bad}]}),
+            "monitor.detectors[0].floor",
+        ),
+        (
+            lambda bad: changed(
+                swap=[{"pass": 2, "part": "monitor", "to": {"name": "swap_detector:Failures", "floor": bad}}]
+            ),
+            "swap[0].to.floor",
+        ),
+    ],
+)
+def test_a_number_that_is_not_finite_is_refused_where_no_model_of_the_options_looks_at_it(
+    table, named, bad, monkeypatch
+):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    with pytest.raises(ConfigError, match=re.escape(f"the file: {named} = {bad} is no finite number, and JSON")):
+        from_table(table(bad), "the file")
 
 
 def test_a_toml_file_cannot_smuggle_in_nan(file):
