@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from mape.errors import ConfigError, UnknownName
 from mape.specs import PartSpec, explain
+from mape.states import FAULTS, told
 
 
 class Entry(NamedTuple):
@@ -89,8 +90,8 @@ def import_for(named: str, module_name: str) -> ModuleType:
                 "(installed packages, PYTHONPATH)"
             ) from None
         raise ConfigError(f"{named} needs the package {error.name!r}, which is not installed") from error
-    except Exception as error:
-        raise ConfigError(f"{named}: its module raised {type(error).__name__}: {error}") from error
+    except FAULTS as error:
+        raise ConfigError(f"{named}: its module raised {told(error)}") from error
 
 
 def find(kind: str, name: str) -> Any:
@@ -155,9 +156,9 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
         missing = [member for member in MEMBERS.get(kind, ()) if not hasattr(made, member)]
     except ConfigError:
         raise
-    except Exception as error:
+    except FAULTS as error:
         raise ConfigError(
-            f"{kind} {spec.name!r} cannot be made with {options or 'no options'}: {type(error).__name__}: {error}"
+            f"{kind} {spec.name!r} cannot be made with {options or 'no options'}: {told(error)}"
         ) from error
     if missing:
         raise ConfigError(f"{kind} {spec.name!r} has no {', '.join(missing)}; see {kind.capitalize()} in mape.ports")

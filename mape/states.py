@@ -1,4 +1,4 @@
-"""The state of a part: given, taken up, handed over to the part that takes its place."""
+"""A part is called: what it may raise. Its state: given, taken up, handed over to the part that takes its place."""
 
 from __future__ import annotations
 
@@ -6,6 +6,22 @@ from typing import Any
 
 from mape.errors import PartError
 from mape.ports import Json
+
+FAULTS = (Exception, SystemExit)
+"""What a part or a managed system raises by its own fault, and what the loop turns into an error that names it.
+
+An exit is one of them: code of the user's, a simulator among it, ends no run. KeyboardInterrupt is none, for it is a
+Ctrl-C, in whatever code it was heard.
+"""
+
+
+def told(error: BaseException) -> str:
+    """Say what was raised: its kind, and its text where it has one.
+
+    >>> told(ZeroDivisionError("no budget")), told(SystemExit())
+    ('ZeroDivisionError: no budget', 'SystemExit')
+    """
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def state_of(kind: str, part: Any) -> Json:
@@ -69,9 +85,8 @@ def _call(kind: str, part: Any, method: str, *arguments: Any) -> Any:
         )
     try:
         return getattr(part, method)(*arguments)
-    except Exception as error:
-        told = f" {arguments[0]!r}" if arguments else ""
+    except FAULTS as error:
+        of = f" of {arguments[0]!r}" if arguments else ""
         raise PartError(
-            f"{kind} {name} raised {type(error).__name__}: {error}, at {method}(){' of' if told else ''}{told}. Mend "
-            "it, and run `mapek check` on it."
+            f"{kind} {name} raised {told(error)}, at {method}(){of}. Mend it, and run `mapek check` on it."
         ) from error

@@ -171,7 +171,7 @@ class Answers:
                     f"{role} is of {name} {there}, Knowledge of {name} {here}; run the same version everywhere"
                 )
         if self._config is not None and join.config != self._config:
-            name, here, there = first_difference(self._config, join.config)
+            name, here, there = first_difference(_telling_first(self._config), _telling_first(join.config))
             raise Refusal(
                 f"{OF_CONFIG}{role} has another config than Knowledge: {name} is {there!r} in {role}, and {here!r} in "
                 "Knowledge. Give both the same file and the same --set"
@@ -287,6 +287,15 @@ class Answers:
         if not 0 <= number < self._ledger.units:
             raise ValueError(f"loop {number}; this run has loops 0 to {self._ledger.units - 1}")
         return number
+
+
+def _telling_first(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a config with what tells most at its beginning, and what is only for people at its end."""
+    rest = [name for name in config if name not in ("system", *_FOR_PEOPLE)]
+    return {name: config[name] for name in ("system", *rest, *_FOR_PEOPLE) if name in config}
+
+
+_FOR_PEOPLE = ("name", "description")
 
 
 def _payload(query: zenoh.Query, largest: int) -> bytes:

@@ -46,7 +46,7 @@ def document() -> dict[str, Any]:
             "channel": to,
             "messages": [{"$ref": f"#/channels/{name}/messages/{message}"} for message in asked],
             **(
-                {"reply": {"messages": [{"$ref": f"#/channels/{name}/messages/{m}"} for m in answered]}}
+                {"reply": {"channel": to, "messages": [{"$ref": f"#/channels/{name}/messages/{m}"} for m in answered]}}
                 if answered
                 else {}
             ),
@@ -89,7 +89,7 @@ def document() -> dict[str, Any]:
         "channels": channels,
         "operations": operations,
         "components": {
-            "messages": _messages(),
+            **_messages_and_schemas(),
             "parameters": {
                 "system": {"description": "the managed system: a-z, 0-9, _ and -"},
                 "loop": {"description": "number of the loop, from 0"},
@@ -99,14 +99,28 @@ def document() -> dict[str, Any]:
     }
 
 
-def _messages() -> dict[str, Any]:
+def _messages_and_schemas() -> dict[str, Any]:
+    """Return the messages, and what their payloads share under the names by which they refer to it."""
     schemas = {tag.partition("/")[0]: (tag, schema) for tag, schema in json_schemas().items()}
     for kind in messages.MESSAGES:
         schema = kind.model_json_schema(by_alias=True)
         schema["properties"] = {"schema": {"const": kind.tag()}, **schema["properties"]}
         schema["required"] = ["schema", *schema.get("required", [])]
         schemas[kind.__name__] = (kind.tag(), schema)
-    return {
-        name: {"name": tag, "contentType": "application/json", "payload": schema}
-        for name, (tag, schema) in schemas.items()
-    }
+    found: dict[str, Any] = {}
+    shared: dict[str, Any] = {}
+    for name, (tag, schema) in schemas.items():
+        payload = _pointed(schema)
+        shared |= payload.pop("$defs", {})
+        found[name] = {"name": tag, "contentType": "application/json", "payload": payload}
+    return {"messages": found, "schemas": shared}
+
+
+def _pointed(part: Any) -> Any:
+    """Return a part of a payload whose references lead to the whole document's schemas, not to its own."""
+    if isinstance(part, dict):
+        return {
+            key: value.replace("#/$defs/", "#/components/schemas/") if key == "$ref" else _pointed(value)
+            for key, value in part.items()
+        }
+    return [_pointed(item) for item in part] if isinstance(part, list) else part

@@ -19,6 +19,6 @@ def execute(chosen: argparse.Namespace) -> int:
         return 0
     certificates.make(folder, chosen.host, chosen.days)
     print(f"{folder}: an authority, and keys and certificates for {', '.join(ROLES)}; good for {chosen.days:,} days.")
-    print(f"{KNOWLEDGE} is reached as {', '.join((*certificates.LOCAL_HOSTS, *chosen.host))}.")
+    print(f"{KNOWLEDGE} is reached as {', '.join(dict.fromkeys((*certificates.LOCAL_HOSTS, *chosen.host)))}.")
     print("A host needs ca.pem, and the .pem and .key of its roles. Keep ca.key apart: who has it can be any role.")
     return 0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,14 +38,14 @@ class Dropped(NamedTuple):
     last: int
 
 
-Entry = tuple[int, int, "str | Swap | Dropped"]
+Entry = tuple[int, int, "str | Swap | Dropped | Event"]
 """Pass, stage, and what stands there: a record as JSON, or what happened before it."""
 
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
-    with _opened(chosen) as store:
-        config = _config(store, chosen.follow)
+    with opened(Path(chosen.folder), chosen.follow) as store:
+        config = config_in(store, chosen.follow)
         if config is None:
             raise ResultsError(f"{store.path} holds no record yet; --follow waits for the first")
         units, episodes = config["trials"] * config["loops"], config["episodes"]
@@ -55,19 +57,22 @@ def execute(chosen: argparse.Namespace) -> int:
         loops = range(units) if chosen.loop is None else [chosen.loop]
         stages = range(4) if chosen.stage is None else [STAGES.index(chosen.stage)]
         cursors = [Cursor(store, loop, stages, first, last) for loop in loops]
+        if chosen.events:
+            for cursor in cursors:
+                cursor.tell_events(of_all=cursor is cursors[0])
         printer = _JsonLines() if chosen.json else _Sentences(units)
-        events = 0
+        told = False
         while True:
             over = not chosen.follow or all(store.last(loop)[3] >= last for loop in loops)
-            if chosen.events:
-                for event in store.events(events):
-                    events = event.number
-                    if _wanted(event, chosen.loop, chosen.passes):
-                        printer.event(event)
             for cursor in cursors:
                 for number, stage, what in cursor.read(over):
                     printer.entry(cursor.loop, number, stage, what)
+                    told = True
             printer.flush()
+            if over and not told:
+                begun = any(store.count(loop) for loop in range(units))
+                none = "no such record" if begun else "no record yet; --follow waits for the first"
+                raise ResultsError(f"{store.path} holds {none}")
             if over:
                 return 0
             time.sleep(LOOK_EVERY)  # another process writes the file, and tells nobody
@@ -95,6 +100,13 @@ class Cursor:
         # Of a free-running loop each stage is at another pass.
         self._next = dict.fromkeys(stages, first)
         self._told: set[tuple[object, ...]] = set()
+        self._wants_events = self._of_all = False
+        self._newest = 0  # number of the last event that was looked at
+        self._waiting: list[Entry] = []  # events that were not yielded yet
+
+    def tell_events(self, *, of_all: bool) -> None:
+        """Yield the loop's events too from now on, and, if `of_all`, those that are of no single loop."""
+        self._wants_events, self._of_all = True, of_all
 
     def read(self, over: bool) -> Iterator[Entry]:
         """Yield what is new, in order of pass and stage; if it is `over`, what stands after the last record too."""
@@ -112,11 +124,16 @@ class Cursor:
                     yield number, stage, body
         if over:
             yield from self._before(self._beside(), (last + 1, 0))
+        else:  # what happens while no record comes may be why none does
+            yield from self._before(self._events(), (last + 1, 0))
 
     def _before(self, beside: list[Entry], place: tuple[int, int]) -> Iterator[Entry]:
         while beside and beside[0][:2] <= place:
             entry = beside.pop(0)
-            self._told.add(_key(entry))
+            if isinstance(entry[2], Event):
+                self._waiting.remove(entry)
+            else:
+                self._told.add(_key(entry))
             yield entry
 
     def _beside(self) -> list[Entry]:
@@ -132,7 +149,30 @@ class Cursor:
             for swap in self._store.swaps()
             if swap.loop == self.loop and first <= swap.pass_no <= last
         ]
-        return sorted((entry for entry in found if _key(entry) not in self._told), key=lambda entry: entry[:2])
+        found = [entry for entry in found if _key(entry) not in self._told]
+        return sorted([*self._events(), *found], key=lambda entry: entry[:2])
+
+    def _events(self) -> list[Entry]:
+        """Return the events that are to be told, each where it happened."""
+        first, last = self._range
+        for event in self._store.events(self._newest) if self._wants_events else ():
+            self._newest = event.number
+            number = event.pass_no or 0
+            if first <= number <= last and (event.loop == self.loop or (event.loop is None and self._of_all)):
+                self._waiting.append((*_place(event), event))
+        self._waiting.sort(key=lambda entry: entry[:2])
+        return [*self._waiting]
+
+
+def _place(event: Event) -> tuple[int, int]:
+    """Return pass and stage before which an event stands."""
+    number, stage = event.pass_no or 0, STAGE_OF.get(event.role, 0)
+    if event.loop is not None:
+        return number, stage
+    # The run was in this pass: the role's own record of it was still to come, or, of Execute, that of the next one.
+    if number == 0:
+        return 0, 0
+    return (number, stage) if stage else (number + 1, 0)
 
 
 def _key(entry: Entry) -> tuple[object, ...]:
@@ -144,7 +184,10 @@ class _Sentences:
         self._units = units
         self._at: tuple[int, int] | None = None
 
-    def entry(self, loop: int, number: int, stage: int, what: str | Swap | Dropped) -> None:
+    def entry(self, loop: int, number: int, stage: int, what: str | Swap | Dropped | Event) -> None:
+        if isinstance(what, Event):
+            self._event(what)
+            return
         of = f"loop {loop}, " if self._units > 1 else ""
         if isinstance(what, Dropped):
             one = what.first == what.last
@@ -166,10 +209,12 @@ class _Sentences:
             said = f"{said.removesuffix('.')}; the plan was {record.age} passes old."
         print(said)
 
-    def event(self, event: Event) -> None:
-        self._at = None
+    @staticmethod
+    def _event(event: Event) -> None:
         stamp = time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(event.time))
-        where = "" if event.loop is None else f" (loop {event.loop}, pass {event.pass_no})"
+        where = f" (loop {event.loop}, pass {event.pass_no})"
+        if event.loop is None:
+            where = f" (in pass {event.pass_no})" if event.pass_no else ""
         print(f"Event     {stamp} UTC, {event.role} {event.kind}{where}: {event.text}")
 
     def flush(self) -> None:
@@ -177,9 +222,11 @@ class _Sentences:
 
 
 class _JsonLines:
-    def entry(self, loop: int, number: int, stage: int, what: str | Swap | Dropped) -> None:
+    def entry(self, loop: int, number: int, stage: int, what: str | Swap | Dropped | Event) -> None:
         if isinstance(what, str):
             print(what)
+        elif isinstance(what, Event):
+            self._event(what)
         elif isinstance(what, Swap):
             _, _, part, spec, handed_over, planned = what
             self._print(
@@ -189,7 +236,7 @@ class _JsonLines:
         else:
             self._print(dropped=what._asdict())
 
-    def event(self, event: Event) -> None:
+    def _event(self, event: Event) -> None:
         number, clock, role, kind, loop, pass_no, text = event
         self._print(
             event={
@@ -205,30 +252,37 @@ class _JsonLines:
         print(json.dumps(what, separators=(",", ":")))
 
 
-def _opened(chosen: argparse.Namespace) -> Store:
-    folder = Path(chosen.folder)
+def opened(folder: Path, follow: bool) -> Store:
+    """Open the log of a run's folder for reading; if it is to be followed, wait for it, and say so.
+
+    Raises
+    ------
+    ResultsError
+        The folder has no log, or will never have one.
+    """
+    waits = False
     while True:
-        path = log_of(folder)
+        there = os.path.exists(folder)
+        path = log_of(folder) if there or not follow else None
         if path is not None:
             return Store(path, readonly=True)
-        if read_manifest(folder).get("kind") != "up":
+        # A folder takes its name before there is anything in it.
+        begun = there and (not follow or os.path.exists(folder / "manifest.json"))
+        if begun and read_manifest(folder).get("kind") != "up":
             raise ResultsError(
                 f"{folder} has the tables of a run, and no log of its records: `mapek up` and `mapek serve` write one. "
                 "`mapek run CONFIG --show FROM:TO` prints records while it runs"
             )
-        if not chosen.follow:
+        if not follow:
             raise ResultsError(f"{folder} has no log yet; --follow waits for it")
+        if not waits:
+            waits = True
+            print(f"waiting for the log of {folder}", file=sys.stderr)
         time.sleep(LOOK_EVERY)  # until another process has made it
 
 
-def _config(store: Store, follow: bool) -> dict[str, Any] | None:
+def config_in(store: Store, follow: bool) -> dict[str, Any] | None:
+    """Return the config of a log's run; None where it is not written yet, unless the log is followed."""
     while (config := store.facts().get("config")) is None and follow:
         time.sleep(LOOK_EVERY)  # until another process has written it
     return config
-
-
-def _wanted(event: Event, loop: int | None, passes: tuple[int, int] | None) -> bool:
-    """Whether an event is of the loop and passes that are asked for; what is of none always is."""
-    if loop is not None and event.loop not in (None, loop):
-        return False
-    return passes is None or event.pass_no is None or passes[0] <= event.pass_no <= passes[1]

@@ -37,16 +37,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 2
     chosen.arguments = arguments  # which the folder of a run keeps, for `mapek resume`
-    if chosen.version:
-        from adapters.results.folder import versions
-
-        print(", ".join(f"{name} {version}" for name, version in versions().items()))
-        return 0
-    if chosen.command is None:
+    if chosen.command is None and not chosen.version:
         top.print_help()
         return 2
     try:
-        code = dispatch(chosen)
+        code = _version() if chosen.version else dispatch(chosen)
         sys.stdout.flush()  # here, where what goes wrong can still be said
         return code
     except KeyboardInterrupt as stop:
@@ -54,6 +49,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     except Exception as error:
         return _failed(error)
+
+
+def _version() -> int:
+    from adapters.results.folder import versions
+
+    print(", ".join(f"{name} {version}" for name, version in versions().items()))
+    return 0
 
 
 def _notes(error: BaseException) -> str:

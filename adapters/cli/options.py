@@ -143,7 +143,7 @@ def parser() -> argparse.ArgumentParser:
         description="Print the records that a run of `mapek up` or `mapek serve` has logged, finished or not.",
     )
     log.add_argument("folder", metavar="DIR", help="folder of the run, or its log.sqlite")
-    log.add_argument("--pass", dest="passes", type=_span, metavar="N|FROM:TO", help="only these passes")
+    log.add_argument("--pass", dest="passes", type=_passes, metavar="N|FROM:TO", help="only these passes")
     log.add_argument("--stage", choices=["observation", "symptom", "request", "plan"], help="only this kind of record")
     log.add_argument("--loop", type=_natural, metavar="L", help="only this loop, by its number in the records")
     log.add_argument("--events", action="store_true", help="what happened beside the records too: who joined, ...")
@@ -299,11 +299,19 @@ def _whole(text: str, least: int) -> int:
 
 
 def _span(text: str) -> tuple[int, int]:
+    return _between(text, 1, "FROM:TO with 1 <= FROM <= TO, such as 298:305")
+
+
+def _passes(text: str) -> tuple[int, int]:
+    return _between(text, 0, "N or FROM:TO with 0 <= FROM <= TO, such as 300 or 298:305; 0 is the start")
+
+
+def _between(text: str, least: int, legal: str) -> tuple[int, int]:
     first, _, last = text.partition(":")
     try:
         span = int(first), int(last or first)
     except ValueError:
-        span = 0, 0
-    if not 1 <= span[0] <= span[1]:
-        raise argparse.ArgumentTypeError(f"{text!r} is not FROM:TO with 1 <= FROM <= TO, such as 298:305")
+        span = -1, -1
+    if not least <= span[0] <= span[1]:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {legal}")
     return span

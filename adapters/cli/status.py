@@ -23,7 +23,7 @@ def execute(chosen: argparse.Namespace) -> int:
         raise BusError(f"Knowledge on {wire.endpoint} did not answer; with keys, only a role that it knows may ask")
     for status in found:
         if chosen.json:
-            json.dump(status.model_dump(mode="json"), sys.stdout, indent=2)
+            json.dump({"schema": status.tag(), **status.model_dump(mode="json")}, sys.stdout, indent=2)
             print()
         else:
             _print(status)

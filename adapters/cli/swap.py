@@ -8,10 +8,12 @@ from typing import Any
 
 from adapters.buses.messages import Control, Replaced
 from adapters.cli.common import operator
+from adapters.processes.replacing import CHECKED_WITHIN
 from mape.errors import BusError, ConfigError, MapekError
 from mape.parts import owner
+from mape.tables import refuse_infinity
 
-ANSWERED_WITHIN = 60.0
+ANSWERED_WITHIN = CHECKED_WITHIN + 15.0
 """Seconds that a role has to check the part and to reach the end of its pass."""
 
 
@@ -35,14 +37,17 @@ def execute(chosen: argparse.Namespace) -> int:
 
 
 def _spec(text: str) -> dict[str, Any]:
+    if not text.strip():
+        raise ConfigError('the new part has no name; give one of `mapek list`, or "module:Class"')
     if not text.lstrip().startswith("{"):
         return {"name": text}
     try:
         table = tomllib.loads(f"to = {text}")["to"]
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f'{text!r} is no inline table such as {{name = "morphin", alpha = 0.2}}: {error}') from None
-    if not isinstance(table.get("name"), str):
+    if not (isinstance(name := table.get("name"), str) and name.strip()):
         raise ConfigError(f'{text!r} names no part; give {{name = "..."}} and its options')
+    refuse_infinity(table, f"{text!r}: ")
     return dict(table)
 
 

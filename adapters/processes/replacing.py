@@ -25,12 +25,16 @@ from mape.config import Config
 from mape.errors import BusError, ConfigError, MapekError, PartError
 from mape.parts import owner, with_part
 from mape.specs import PartSpec
+from mape.states import told
 from mape.swap import replace_part, vet
 
 logger = logging.getLogger(__name__)
 
 _HELD = {"monitor": "detectors", "analyze": "analyzer", "plan": "planner"}
 """Role -> where its component holds its part."""
+
+CHECKED_WITHIN = 45.0
+"""Seconds that the check of a part may take, its compilation among it; who asks for the part waits some longer."""
 
 
 class Due(NamedTuple):
@@ -129,7 +133,7 @@ class Replacing(ABC):
                 wanted = Wanted(asked, control.part, spec_of(control.to))
                 self._unanswered.append(wanted)
                 # Its checks take their time, in which the loop goes on.
-                threading.Thread(target=self._vet, args=(wanted,), daemon=True).start()
+                threading.Thread(target=self._vet_in_time, args=(wanted,), daemon=True).start()
         except (MapekError, ValueError) as error:
             self.member.refuse(asked.query, str(error))
 
@@ -137,12 +141,19 @@ class Replacing(ABC):
         """Hand out the Q-table; only Execute has one."""
         raise BusError(f"{self.name} has no Q-table; Execute has")
 
-    def _vet(self, wanted: Wanted) -> None:
+    def _vet_in_time(self, wanted: Wanted) -> None:
+        found: list[list[str]] = []
+        checks = threading.Thread(target=lambda: found.append(self._vet(wanted)), daemon=True)
+        checks.start()
+        checks.join(CHECKED_WITHIN)  # a thread cannot be ended: what takes longer is no more listened to
+        late = f"its check has not ended within {CHECKED_WITHIN:g} s; `mapek check` shows by clauses how far it comes"
+        self._vetted.append((wanted, found[0] if found else [late]))
+
+    def _vet(self, wanted: Wanted) -> list[str]:
         try:
-            faults = vet(wanted.part, wanted.spec, self.units[0].config)
-        except Exception as error:  # whatever a part of the user's does, the loop goes on
-            faults = [reason(error)]
-        self._vetted.append((wanted, faults))
+            return vet(wanted.part, wanted.spec, self.units[0].config)
+        except BaseException as error:  # a Ctrl-C is heard in the main thread: what comes here is the part's
+            return [reason(error)]
 
     def _let_in(self) -> None:
         wanted, faults = self._vetted.popleft()
@@ -251,13 +262,13 @@ class Replacing(ABC):
             self.member.answer(wanted.asked, answer.pack())
 
 
-def reason(error: Exception) -> str:
+def reason(error: BaseException) -> str:
     """Return what an error says; of one that is not the loop's own, its kind too.
 
     >>> reason(ZeroDivisionError("no budget")), reason(MapekError("epsilon is 2"))
     ('ZeroDivisionError: no budget', 'epsilon is 2')
     """
-    return str(error) if isinstance(error, MapekError) else f"{type(error).__name__}: {error}"
+    return str(error) if isinstance(error, MapekError) else told(error)
 
 
 def spec_of(to: dict[str, Any]) -> PartSpec:

@@ -224,9 +224,12 @@ class RunFolder:
         runs = {name: value for name, value in there.items() if name not in (*BEGUN_BY, MODULES)}
         if runs != wanted:
             what, had, has = first_difference(runs, wanted)
+            way_out = "give the same command to continue it"
+            if what.startswith("versions."):
+                way_out = "hashes hold for equal versions only: install those it was begun with to continue it"
             raise ResultsError(
-                f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; give the same command to "
-                "continue it, or choose another --out"
+                f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; {way_out}, or choose another "
+                "--out"
             )
         if (said := other_version(there.get(MODULES) or {})) is not None:
             raise ResultsError(

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
+import os
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self
 
@@ -54,7 +57,7 @@ class Database:
                     raise ResultsError(f"there is no log {path}; `mapek up` and `mapek serve` write one")
                 self._db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
             else:
-                self._lock = None if path is None else _locked(path)
+                self._lock = None if path is None else self._made(path) or _locked(path)
                 # Written by the one thread that answers all queries, opened by another.
                 self._db = sqlite3.connect(path or ":memory:", isolation_level=None, check_same_thread=False)
             self._open(durability, readonly)
@@ -67,9 +70,9 @@ class Database:
             raise
 
     def _open(self, durability: str, readonly: bool) -> None:
-        application = self._number("PRAGMA application_id")
-        version = self._number("PRAGMA user_version")
-        empty = self._number("SELECT count(*) FROM sqlite_master") == 0
+        queries = ("PRAGMA application_id", "PRAGMA user_version", "SELECT count(*) FROM sqlite_master")
+        application, version, tables = (self._db.execute(query).fetchone()[0] for query in queries)
+        empty = tables == 0
         if (empty and readonly) or (not empty and application != self.form.application):
             raise ResultsError(f"{self.path} is no log of a run; name the folder or file that `mapek up` wrote")
         if not empty and version != self.form.version:
@@ -84,8 +87,35 @@ class Database:
             # Each checkpoint waits for the disk, and all that wait for an acknowledgement wait with it.
             self._db.execute("PRAGMA wal_autocheckpoint = 4000")
         if empty:
-            script = f"PRAGMA application_id = {self.form.application}; PRAGMA user_version = {self.form.version};"
-            self._db.executescript(f"BEGIN; {self.form.schema} {script} COMMIT;")
+            self._db.executescript(self._script())
+
+    def _script(self) -> str:
+        form = self.form
+        known = f"PRAGMA application_id = {form.application}; PRAGMA user_version = {form.version};"
+        return f"BEGIN; {form.schema} {known} COMMIT;"
+
+    def _made(self, path: Path) -> IO[bytes] | None:
+        """Make a file that takes its name with its tables in it, for who waits for it; return what holds it.
+
+        None where there is one already, or it can only be made in its place.
+        """
+        if os.path.lexists(path):
+            return None
+        part = path.with_name(f"{path.name}.{os.getpid()}.part")
+        held = None
+        try:
+            held = _locked(part)
+            with contextlib.closing(sqlite3.connect(part, isolation_level=None)) as db:
+                db.executescript(self._script())
+            os.link(part, path)  # which, unlike a change of name, takes the place of no other
+            return held
+        except (OSError, sqlite3.Error, ResultsError):  # what stands in the way is told where it is opened
+            if held is not None:
+                held.close()
+            return None
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Leave the file; what was not committed is gone."""
@@ -142,9 +172,39 @@ class Database:
                 "with `mapek resume`."
             ) from error
 
+    # Reading.
+
+    def _each(self, statement: str, *values: Any) -> Iterator[Any]:
+        try:
+            yield from self._db.execute(statement, values)
+        except sqlite3.Error as error:
+            raise self._unreadable(error) from error
+
+    def _all(self, statement: str, *values: Any) -> list[Any]:
+        return list(self._each(statement, *values))
+
+    def _first(self, statement: str, *values: Any) -> Any:
+        """Return the first row that is found, or None."""
+        try:
+            return self._db.execute(statement, values).fetchone()
+        except sqlite3.Error as error:
+            raise self._unreadable(error) from error
+
     def _number(self, statement: str, *values: Any) -> int:
-        found = self._db.execute(statement, values).fetchone()
+        found = self._first(statement, *values)
         return -1 if found is None or found[0] is None else int(found[0])
+
+    def _json(self, text: Any, where: str) -> Any:
+        try:
+            return json.loads(text)
+        except (TypeError, ValueError) as error:
+            raise self._unreadable(f"{where} is no JSON: {error}") from error
+
+    def _unreadable(self, why: object) -> ResultsError:
+        return ResultsError(
+            f"{self.path} cannot be read: {why}. What is damaged there only a copy from before mends, or a new run in "
+            "another folder."
+        )
 
 
 def _locked(path: Path) -> IO[bytes]:

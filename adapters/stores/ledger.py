@@ -25,6 +25,7 @@ from knowledge import (
     from_json,
 )
 from mape.errors import BusError, ResultsError
+from mape.states import told
 
 WINDOW = 1
 """Finished passes of each loop that stay in memory; what is older is read from the store."""
@@ -213,11 +214,16 @@ class Ledger:
         self.store.keep_swap(swap)
 
     def note(self, role: str, kind: str, text: str, loop: int | None = None, number: int | None = None) -> None:
-        """Note what happened beside the records: of each kind the first thousand, and the number of all refusals."""
+        """Note what happened beside the records: of each kind the first thousand, and the number of all refusals.
+
+        What is of no single loop is noted with the newest pass that was driven by then.
+        """
         self.refused += kind == "refused"
         self._noted[kind] += 1
         if self._noted[kind] > EVENTS_KEPT:
             return
+        if loop is None:
+            number = max((self.last(unit)[0] for unit in range(self.units)), default=0)
         self.store.event(role, kind, text, loop, number)
 
     @property
@@ -295,8 +301,17 @@ class Ledger:
 
 
 def layout_from(facts: Mapping[str, Any]) -> RowLayout:
-    """Make the layout that a role told Knowledge."""
-    return RowLayout(tuple(facts["signals"]), facts["detectors"], facts["rates"], facts["max_actions"])
+    """Make the layout that a role told Knowledge.
+
+    Raises
+    ------
+    ResultsError
+        These are no facts of a layout, as in a damaged log.
+    """
+    try:
+        return RowLayout(tuple(facts["signals"]), facts["detectors"], facts["rates"], facts["max_actions"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise ResultsError(f"the layout of the run's rows, {facts!r}, is damaged: {told(error)}") from error
 
 
 def differences(there: str, given: str) -> str:

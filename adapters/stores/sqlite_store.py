@@ -5,19 +5,23 @@ Schema, version 1 (``PRAGMA user_version``); times are seconds since 1970, in UT
 =============  ==========================================================================================
 table          holds
 =============  ==========================================================================================
-``run``        facts of the run by name, as JSON: config, versions, layout, seal, begun
+``run``        facts of the run by name, as JSON: config, versions, layout, seal; and begun, the
+               last episode that each loop began, of systems that cannot be driven again
 ``records``    the log: one row per record. ``stage`` is 0 Observation, 1 Symptom, 2 ChangeRequest,
                3 ChangePlan; ``body`` the record as JSON, byte for byte as it was sent; ``row``, with a
                ChangePlan of a lockstep run, the packed pass of which the log's hash is taken
 ``dropped``    of free-running loops: the episodes that were driven and could not be logged
 ``snapshots``  the newest states of each role, from which it goes on after a crash: JSON, and the hash of
                a Q-table; ``final`` marks the one at the end of the run
-``q_tables``   Q-tables by SHA-256: ids of the rows, number of states, row-major little-endian float64
+``q_tables``   Q-tables: ids of the rows as JSON, number of states, and the values, row-major little-endian
+               float64. Their ``sha256`` is of shape and ids, each a little-endian int64, and then the values:
+               of ``struct.pack(f"<{2 + rows}q", rows, states, *ids) + body``
 ``versions``   which Q-table was the one at the end of an episode, where a planner asked for it
 ``swaps``      parts that were replaced, the first pass that the new one served, whether it took over the old
                one's state, and whether the config had planned it
 ``roles``      how often each role has joined: its newest epoch
-``events``     what happened beside the records: who joined, what was refused or aborted
+``events``     what happened beside the records: who joined, what was refused or aborted; where ``loop`` is
+               NULL, ``pass`` is the newest one that had been driven in any loop
 =============  ==========================================================================================
 """
 
@@ -107,7 +111,8 @@ class Store(Database):
 
     def facts(self) -> dict[str, Any]:
         """Return the facts of the run; empty where it has not begun."""
-        return {name: json.loads(value) for name, value in self._db.execute("SELECT name, value FROM run")}
+        found = self._all("SELECT name, value FROM run")
+        return {name: self._json(value, f"the {name} in value of run") for name, value in found}
 
     def set_facts(self, **facts: Any) -> None:
         """Write facts of the run."""
@@ -135,7 +140,7 @@ class Store(Database):
     def body(self, loop: int, number: int, stage: int) -> str | None:
         """Return a record as JSON, or None where it is not in the log."""
         query = "SELECT body FROM records WHERE loop = ? AND pass = ? AND stage = ?"
-        found = self._db.execute(query, (loop, number, stage)).fetchone()
+        found = self._first(query, loop, number, stage)
         return None if found is None else str(found[0])
 
     def last(self, loop: int) -> tuple[int, int, int, int]:
@@ -154,12 +159,12 @@ class Store(Database):
         where = " OR ".join("(stage = ? AND pass >= ?)" for _ in stages)
         values = [value for pair in stages.items() for value in pair]
         query = f"SELECT pass, stage, body FROM records WHERE loop = ? AND pass >= ? AND ({where}) ORDER BY pass, stage LIMIT ?"  # noqa: E501
-        return self._db.execute(query, (loop, min(stages.values()), *values, limit)).fetchall()
+        return self._all(query, loop, min(stages.values()), *values, limit)
 
     def rows(self, loop: int) -> Iterator[bytes]:
         """Yield the packed rows of plan 0 and of each finished pass, in order."""
         query = "SELECT row FROM records WHERE loop = ? AND stage = 3 ORDER BY pass"
-        for (row,) in self._db.execute(query, (loop,)):
+        for (row,) in self._each(query, loop):
             yield row
 
     def drop(self, loop: int, first: int, last: int) -> None:
@@ -169,7 +174,7 @@ class Store(Database):
     def dropped(self, loop: int) -> list[tuple[int, int]]:
         """Return what was dropped, as (first, last)."""
         query = "SELECT first, last FROM dropped WHERE loop = ? ORDER BY first"
-        return self._db.execute(query, (loop,)).fetchall()
+        return self._all(query, loop)
 
     # States and tables.
 
@@ -197,12 +202,12 @@ class Store(Database):
     def snapshot(self, loop: int, role: str) -> Snapshot | None:
         """Return a role's newest state, or None."""
         query = "SELECT pass, final, state, q_table FROM snapshots WHERE loop = ? AND role = ? ORDER BY pass DESC"
-        found = self._db.execute(query, (loop, role)).fetchone()
+        found = self._first(query, loop, role)
         if found is None:
             return None
         number, final, state, key = found
         table = None if key is None else self.table(key)
-        return Snapshot(loop, role, number, json.loads(state), table, bool(final))
+        return Snapshot(loop, role, number, self._json(state, "state of snapshots"), table, bool(final))
 
     def keep_table(self, table: QTable, *, remembered: bool) -> str:
         """Keep a Q-table under its hash, which is returned; one that is remembered stays for the whole run."""
@@ -216,13 +221,22 @@ class Store(Database):
         return key
 
     def table(self, key: str) -> QTable | None:
-        """Return the Q-table with that hash, or None."""
-        found = self._db.execute("SELECT actions, states, body FROM q_tables WHERE sha256 = ?", (key,)).fetchone()
+        """Return the Q-table with that hash, or None.
+
+        Raises
+        ------
+        ResultsError
+            It is not the one that was kept under the hash.
+        """
+        found = self._first("SELECT actions, states, body FROM q_tables WHERE sha256 = ?", key)
         if found is None:
             return None
-        actions, states, body = json.loads(found[0]), found[1], found[2]
-        header = {"schema": TABLE_SCHEMA, "actions": actions, "shape": [len(actions), states], "dtype": "<f8"}
-        return QTable.from_bytes({**header, "sha256": key}, body)
+        try:
+            actions, states, body = json.loads(found[0]), found[1], found[2]
+            header = {"schema": TABLE_SCHEMA, "actions": actions, "shape": [len(actions), states], "dtype": "<f8"}
+            return QTable.from_bytes({**header, "sha256": key}, body)
+        except (TypeError, ValueError) as error:
+            raise self._unreadable(f"the Q-table {key[:12]}... in q_tables is damaged ({error})") from error
 
     def keep_version(self, loop: int, number: int, table: QTable) -> None:
         """Keep the Q-table at the end of episode `number`, for a planner that asked for it."""
@@ -232,7 +246,7 @@ class Store(Database):
     def version(self, loop: int, number: int) -> QTable | None:
         """Return the Q-table at the end of episode `number` if it was asked for before, or None."""
         query = "SELECT q_table FROM versions WHERE loop = ? AND pass = ?"
-        found = self._db.execute(query, (loop, number)).fetchone()
+        found = self._first(query, loop, number)
         return None if found is None else self.table(found[0])
 
     # What happened beside the records.
@@ -250,9 +264,9 @@ class Store(Database):
 
     def swaps(self) -> list[Swap]:
         """Return the parts that were replaced while the loop ran, in order of loop and pass."""
-        found = self._db.execute("SELECT * FROM swaps ORDER BY loop, pass, part")
+        found = self._all("SELECT loop, pass, part, spec, handed_over, planned FROM swaps ORDER BY loop, pass, part")
         return [
-            Swap(loop, number, part, json.loads(spec), bool(handed_over), bool(planned))
+            Swap(loop, number, part, self._json(spec, "spec of swaps"), bool(handed_over), bool(planned))
             for loop, number, part, spec, handed_over, planned in found
         ]
 
@@ -266,4 +280,4 @@ class Store(Database):
     def events(self, after: int = 0) -> list[Event]:
         """Return the events numbered above `after`."""
         query = "SELECT number, time, role, kind, loop, pass, text FROM events WHERE number > ? ORDER BY number"
-        return [Event(*row) for row in self._db.execute(query, (after,))]
+        return [Event(*row) for row in self._all(query, after)]

@@ -19,6 +19,7 @@ from managed_systems.rules import available
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
+from mape.states import FAULTS
 
 _RULES = tuple(name for name in vars(StepRules) if not name.startswith("_"))
 
@@ -70,7 +71,7 @@ def _make_by_id(config: SystemConfig) -> gymnasium.Env[Any, Any]:
         raise ConfigError(
             f"system {config.id!r} needs the module {name!r}, which is neither installed nor in this folder"
         ) from error
-    except Exception as error:
+    except FAULTS as error:
         raise refusal(config, error) from error
 
 

@@ -10,10 +10,10 @@ from gymnasium.envs.registration import load_env_creator
 
 from mape.config import SystemConfig
 from mape.errors import ConfigError, UnknownName
-from mape.states import FAULTS
+from mape.states import FAULTS, told
 
 
-def refusal(config: SystemConfig, error: Exception) -> ConfigError:
+def refusal(config: SystemConfig, error: BaseException) -> ConfigError:
     """Return the error for what an environment raised while it was made.
 
     An option that it does not have is named with those it has; else it speaks for itself, beside its options.
@@ -24,7 +24,8 @@ def refusal(config: SystemConfig, error: Exception) -> ConfigError:
         return UnknownName(f"option of system {config.id!r}:", unknown[0], legal or ())
     if isinstance(error, TypeError) and isinstance(error.__context__, TypeError):
         error = error.__context__  # Gymnasium raises it again, with the options behind it
-    return ConfigError(f"system {config.id!r} with options {config.options}: {error}")
+    said = error if isinstance(error, Exception) else told(error)  # of an exit, the text is but its code
+    return ConfigError(f"system {config.id!r} with options {config.options}: {said}")
 
 
 def _options_of(identifier: str) -> list[str] | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from knowledge import ChangeRequest, Symptom
 from mape.errors import PartError
 from mape.ports import Analyzer, Json
-from mape.states import hand_over, restore, state_of
+from mape.states import FAULTS, hand_over, restore, state_of, told
 
 
 class Analyze:
@@ -35,10 +35,9 @@ class Analyze:
         """
         try:
             request = self.analyzer.analyze(symptom)
-        except Exception as error:
+        except FAULTS as error:
             raise PartError(
-                f"analyzer {type(self.analyzer).__name__} raised {type(error).__name__}: {error}, at pass "
-                f"{symptom.pass_no}"
+                f"analyzer {type(self.analyzer).__name__} raised {told(error)}, at pass {symptom.pass_no}"
             ) from error
         if type(request) is not ChangeRequest:
             raise PartError(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from knowledge import ChangePlan, from_json, to_json
 from mape.errors import ManagedSystemError, PartError
 from mape.ports import Json, ManagedSystem
+from mape.states import FAULTS, told
 
 
 class Checkpoint(NamedTuple):
@@ -69,10 +70,8 @@ def carried_by(system: ManagedSystem) -> Json:
     """
     try:
         return system.get_state()
-    except Exception as error:
-        raise ManagedSystemError(
-            f"{system.name} raised {type(error).__name__}: {error}, when it was asked for its state"
-        ) from error
+    except FAULTS as error:
+        raise ManagedSystemError(f"{system.name} raised {told(error)}, when it was asked for its state") from error
 
 
 def take_up(system: ManagedSystem, carried: Json, enabled: tuple[int, ...]) -> None:
@@ -88,8 +87,8 @@ def take_up(system: ManagedSystem, carried: Json, enabled: tuple[int, ...]) -> N
             system.set_state(carried)
         elif enabled:
             system.enable(enabled)
-    except Exception as error:
+    except FAULTS as error:
         raise ManagedSystemError(
-            f"{system.name} raised {type(error).__name__}: {error}, when it was to go on from the state {carried} with "
+            f"{system.name} raised {told(error)}, when it was to go on from the state {carried} with "
             f"the actions {enabled} enabled; give it the state of a system of the same config"
         ) from error

@@ -18,6 +18,7 @@ from mape.execute.rules import rate_array
 from mape.execute.uniforms import Uniforms
 from mape.execute.workspace import Workspace
 from mape.ports import Episode, Json, Learner, ManagedSystem
+from mape.states import FAULTS, told
 
 SIGNALS = ("return", "steps", "td_error", "q_change")
 """Signals of every run: return, steps, mean |TD error|, largest absolute change of Q; the system's own follow."""
@@ -188,12 +189,12 @@ class Execute:
             status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
         except BaseException as error:
             self._workspace.roll_back()
-            if isinstance(error, MapekError) or not isinstance(error, Exception):
+            if isinstance(error, MapekError) or not isinstance(error, FAULTS):
                 raise
             if (steps := int(self._workspace.used[1])) < 0:
                 raise self._failed_to_reset(error, number) from error
             raise ManagedSystemError(
-                f"{self.system.name} raised {type(error).__name__}: {error}, in episode {number} at step {steps + 1}. "
+                f"{self.system.name} raised {told(error)}, in episode {number} at step {steps + 1}. "
                 f"Nothing of that episode was learnt; the {self.passes} passes before it stand in the log."
             ) from error
         if status != episode.OK:
@@ -356,14 +357,14 @@ class Execute:
             self._called.state, available = self.system.begin(told)
         except MapekError:
             raise
-        except Exception as error:
+        except FAULTS as error:
             raise self._failed_to_reset(error, number) from error
         # One object as long as nothing changes: what compares by identity is cheap downstream.
         return self.available if available == self.available else available
 
-    def _failed_to_reset(self, error: Exception, number: int) -> ManagedSystemError:
+    def _failed_to_reset(self, error: BaseException, number: int) -> ManagedSystemError:
         return ManagedSystemError(
-            f"{self.system.name} raised {type(error).__name__}: {error}, at the reset of episode {number}. The "
+            f"{self.system.name} raised {told(error)}, at the reset of episode {number}. The "
             f"{self.passes} passes before it stand in the log."
         )
 

@@ -9,7 +9,7 @@ from knowledge import Observation, Reading, Symptom
 from knowledge.rows import DIRECTIONS
 from mape.errors import PartError
 from mape.ports import Detector, Json
-from mape.states import hand_over, restore, state_of
+from mape.states import FAULTS, hand_over, restore, state_of, told
 
 _new = tuple.__new__  # half the cost of a named tuple's own constructor, on the hot path
 
@@ -55,7 +55,7 @@ class Monitor:
                 reading = _new(Reading, (name, value, statistic, alarm, detector.direction))
                 if alarm:
                     detector.reset()
-            except Exception as error:
+            except FAULTS as error:
                 raise self._failed(name, detector, seen, error) from error
             readings += (reading,)
         self._send(_new(Symptom, (loop, number, signals, available, known, readings)))
@@ -111,11 +111,11 @@ class Monitor:
             )
 
     @staticmethod
-    def _failed(name: str, detector: Detector, seen: Observation, error: Exception) -> PartError:
+    def _failed(name: str, detector: Detector, seen: Observation, error: BaseException) -> PartError:
         if isinstance(error, KeyError) and name not in seen.signals:
             return PartError(f"a detector watches signal {name!r}; the run has {', '.join(seen.signals)}")
         return PartError(
-            f"detector {type(detector).__name__} raised {type(error).__name__}: {error}, at pass {seen.pass_no} on "
-            f"{name} = {seen.signals.get(name)}. Records up to that observation are kept; choose another detector in "
-            "[monitor], or mend this one and run `mapek check` on it."
+            f"detector {type(detector).__name__} raised {told(error)}, at pass {seen.pass_no} on {name} = "
+            f"{seen.signals.get(name)}. Records up to that observation are kept; choose another detector, "
+            "or mend this one and run `mapek check` on it."
         )

@@ -9,7 +9,9 @@ from knowledge import ChangePlan, ChangeRequest, Knowledge
 from mape.errors import PartError
 from mape.ports import Json, Planner, Schedule
 from mape.specs import PartSpec
-from mape.states import hand_over, restore, state_of
+from mape.states import FAULTS, hand_over, restore, state_of, told
+
+_NO_ACTIONS: tuple[int, ...] = ()
 
 
 class Plan:
@@ -31,7 +33,7 @@ class Plan:
         self.schedule_spec: PartSpec | None = None  # of the schedule that took the place of the config's, if one did
         self._knowledge = knowledge
         self._send = send
-        self._rate: tuple[float, ...] | None = None  # the last one seen, which is as a rule the next
+        self._rate: object = object()  # the last one seen, which is as a rule the next
 
     def start(self, loop: int) -> ChangePlan:
         """Send plan 0, which starts the run, and return it."""
@@ -47,11 +49,11 @@ class Plan:
         Raises
         ------
         PartError
-            The planner raised, gave no plan, or an exploration rate outside [0, 1].
+            The planner raised, gave no plan, one with a value of a wrong type, or an exploration rate outside [0, 1].
         """
         try:
             plan = self.planner.plan(request, self._knowledge)
-        except Exception as error:
+        except FAULTS as error:
             raise self._failed(request.pass_no, error) from error
         self._check(plan, request.pass_no)
         self._knowledge.plan = plan
@@ -134,7 +136,7 @@ class Plan:
     def _started(self, loop: int) -> ChangePlan:
         try:
             plan = self.planner.start(loop)
-        except Exception as error:
+        except FAULTS as error:
             raise self._failed(0, error) from error
         self._check(plan, 0)
         return plan
@@ -145,22 +147,34 @@ class Plan:
                 f"planner {type(self.planner).__name__} returned {plan!r} at pass {number}; a planner returns a "
                 "ChangePlan"
             )
-        rate, epsilon = plan.learning_rate, plan.epsilon
+        _, _, epsilon, rate, add, drop, enable, reset, adopt = plan
         if rate is not self._rate:
-            if len(rate) != self._knowledge.log.layout.rates:
-                raise PartError(
-                    f"planner {type(self.planner).__name__} gave the learning rate {rate} for pass {number}; the "
-                    f"learner takes {self._knowledge.log.layout.rates} numbers"
-                )
+            rates = self._knowledge.log.layout.rates
+            if not (isinstance(rate, tuple) and len(rate) == rates and all(map(_is_number, rate))):
+                raise self._refused("the learning rate", rate, number, f"the learner takes {rates} numbers, in a tuple")
             self._rate = rate
         if not (isinstance(epsilon, (float, int)) and 0.0 <= epsilon <= 1.0):
-            raise PartError(
-                f"planner {type(self.planner).__name__} gave epsilon {epsilon!r} for pass {number}; an "
-                "exploration rate is a number in [0, 1]"
-            )
+            raise self._refused("epsilon", epsilon, number, "an exploration rate is a number in [0, 1]")
+        if not (add is drop is enable is _NO_ACTIONS):  # as in all passes but a few
+            for name, actions in (("add", add), ("drop", drop), ("enable", enable)):
+                if not (isinstance(actions, tuple) and all(type(action) is int for action in actions)):
+                    raise self._refused(name, actions, number, "it is a tuple of action ids, each an int")
+        if type(reset) is not bool:
+            raise self._refused("reset_detector", reset, number, "it is True or False")
+        if adopt is not None and not isinstance(adopt, str):
+            raise self._refused("adopt", adopt, number, "it is the SHA-256 of a remembered Q-table, as text, or None")
 
-    def _failed(self, number: int, error: Exception) -> PartError:
+    def _refused(self, name: str, value: Any, number: int, legal: str) -> PartError:
+        return PartError(f"planner {type(self.planner).__name__} gave {name} {value!r} for pass {number}; {legal}")
+
+    def _failed(self, number: int, error: BaseException) -> PartError:
+        # Where it is named is not known here: in [plan], in a [[swap]], or in what somebody asks of a running loop.
+        when = f"at pass {number}" if number else "at its start"
         return PartError(
-            f"planner {type(self.planner).__name__} raised {type(error).__name__}: {error}, at pass {number}. Choose "
-            "another in [plan], or mend this one and run `mapek check` on it."
+            f"planner {type(self.planner).__name__} raised {told(error)}, {when}. Choose another planner, or mend this "
+            "one and run `mapek check` on it."
         )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (float, int)) and not isinstance(value, bool)

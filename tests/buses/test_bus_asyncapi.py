@@ -24,12 +24,20 @@ def references(part):
             yield from references(value)
 
 
-def test_every_reference_of_the_wire_leads_somewhere():
+def test_every_reference_leads_somewhere_within_the_document():
     whole = document()
-    for reference in references({key: whole[key] for key in ("channels", "operations")}):
+    for reference in references(whole):
+        assert reference.startswith("#/"), reference
         found = whole
         for step in reference.removeprefix("#/").split("/"):
+            assert step in found, reference
             found = found[step]
+
+
+def test_an_answer_is_one_of_the_messages_of_the_channel_that_it_comes_by():
+    for name, operation in document()["operations"].items():
+        if "reply" in operation:
+            assert operation["reply"]["channel"] == operation["channel"], name
 
 
 def test_every_record_and_message_is_described_with_its_tag():
@@ -62,3 +70,21 @@ def test_the_command_writes_the_document(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out) == document()
     assert main(["schema", "--out", str(tmp_path / "wire.json")]) == 0
     assert json.loads((tmp_path / "wire.json").read_text()) == document()
+
+
+@pytest.mark.parametrize(("out", "says"), [("nodir/s.json", "there is no folder"), (".", "is a folder")])
+def test_a_document_that_has_no_place_is_a_matter_of_usage(tmp_path, monkeypatch, capsys, out, says):
+    monkeypatch.chdir(tmp_path)
+    assert main(["schema", "--out", out]) == 2
+    told = capsys.readouterr().err
+    assert f"--out {out!r}" in told
+    assert says in told
+    assert "finished before" not in told
+
+
+def test_a_document_that_cannot_be_written_speaks_of_no_run(tmp_path, capsys):
+    place = tmp_path / ("long" * 80)
+    assert main(["schema", "--out", str(place)]) == 1
+    told = capsys.readouterr().err
+    assert f"{place} cannot be written" in told
+    assert "finished before" not in told

@@ -2,12 +2,15 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tracemalloc
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -130,24 +133,100 @@ def test_plans_that_came_late_and_episodes_that_were_dropped_are_said(mapek: Map
     assert mapek("log", "log.sqlite", "--pass", "4:5").out.splitlines() == drops[:2]
 
 
-def test_events_are_told_where_they_are_wanted(mapek: Mapek, log: Path) -> None:
-    with Store(log / "log.sqlite") as store:
-        store.event("monitor", "joined", "epoch 1, process 17 on there")
-        store.event("execute", "aborted", "episode 5 was broken off", 0, 5)
-        store.event("plan", "aborted", "of another loop", 1, 5)
+@pytest.fixture
+def eventful(here: Path) -> Path:
+    """A log of two loops, beside which something happened; each event with the pass that the run was in."""
+    write_log(here / "log.sqlite", small(episodes=6, loops=2))
+    with Store(here / "log.sqlite") as store:
+        store.event("plan", "joined", "epoch 1", None, 0)
+        store.event("monitor", "joined", "by a mapek that noted no pass")
+        store.event("execute", "aborted", "episode 4 was broken off", 0, 4)
+        store.event("plan", "joined", "epoch 2", None, 4)
+        store.event("execute", "joined", "epoch 2", None, 4)
+        store.event("execute", "aborted", "of another loop", 1, 5)
+        store.event("monitor", "swap refused", "no part", None, 6)
+        store.commit()
+    return here / "log.sqlite"
+
+
+def _words(line: str) -> str:
+    return (
+        " ".join(line.partition(" UTC, ")[2].split()[:2]).rstrip(":") if line.startswith("Event ") else line.split()[0]
+    )
+
+
+def test_events_stand_where_they_happened(mapek: Mapek, eventful: Path) -> None:
+    assert "Event" not in mapek("log", eventful).out
+    told = [_words(line) for line in mapek("log", eventful, "--events", "--loop", 0).out.splitlines()]
+
+    whole = ["---", "Execute", "Monitor", "Analyze", "Plan"]
+    assert told == [
+        "plan joined", "monitor joined", "---", "Plan", *whole * 3,
+        "execute aborted", "---", "Execute", "Monitor", "Analyze", "plan joined", "Plan",
+        "execute joined", *whole, "---", "Execute", "monitor swap", "Monitor", "Analyze", "Plan",
+    ]  # fmt: skip
+
+
+def test_events_are_told_once_and_those_of_a_loop_beside_its_records(mapek: Mapek, eventful: Path) -> None:
+    lines = mapek("log", eventful, "--events", "--json").out.splitlines()
+    told = [(place, json.loads(line)["event"]) for place, line in enumerate(lines) if line.startswith('{"event"')]
+
+    assert sorted(event["number"] for _, event in told) == [*range(1, 8)]
+    (place,) = (place for place, event in told if event["loop"] == 1)
+    seen = json.loads(lines[place + 1])
+    assert (seen["schema"], seen["loop"], seen["pass"]) == ("Observation/1", 1, 5)
+    assert set(told[0][1]) == {"number", "time", "role", "kind", "loop", "pass", "text"}
+
+
+@pytest.mark.parametrize(
+    ("options", "texts"),
+    [
+        (("--pass", "4"), ["episode 4 was broken off", "epoch 2", "epoch 2"]),
+        (("--pass", "5"), ["of another loop"]),
+        (("--pass", "5", "--loop", "0"), []),
+        (("--pass", "1:3"), []),
+        (("--loop", "1", "--pass", "4:6"), ["epoch 2", "epoch 2", "of another loop", "no part"]),
+    ],
+)
+def test_events_are_told_where_they_are_wanted(
+    mapek: Mapek, eventful: Path, options: tuple[str, ...], texts: list[str]
+) -> None:
+    lines = mapek("log", eventful, "--events", "--json", *options).out.splitlines()
+    assert [json.loads(line)["event"]["text"] for line in lines if line.startswith('{"event"')] == texts
+
+
+def test_an_event_of_no_loop_is_noted_with_the_pass_that_the_run_was_in(here: Path) -> None:
+    write_log(here / "log.sqlite", CONFIG)
+    with Store(here / "new.sqlite") as store:
+        ledger = begin(store, CONFIG)
+        ledger.note("plan", "joined", "at the start")
+        for record in records_of(here / "log.sqlite")[:14]:  # plan 0, three passes, and one Observation
+            take(ledger, record)
+        ledger.note("plan", "joined", "in the fourth pass")
+        ledger.note("execute", "aborted", "of a loop", 0, 9)
+        assert [(event.text, event.pass_no) for event in store.events()] == [
+            ("at the start", 0), ("in the fourth pass", 4), ("of a loop", 9),
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize("options", [(), ("--json",), ("--events",)])
+def test_a_log_without_records_is_said_to_have_none(mapek: Mapek, here: Path, options: tuple[str, ...]) -> None:
+    with Store(here / "log.sqlite") as store:
+        begin(store, CONFIG)
         store.commit()
 
-    assert "joined" not in mapek("log", log).out
-    told = [line for line in mapek("log", log, "--events").out.splitlines() if line.startswith("Event ")]
-    assert [line.partition(" UTC, ")[2] for line in told] == [
-        "monitor joined: epoch 1, process 17 on there",
-        "execute aborted (loop 0, pass 5): episode 5 was broken off",
-        "plan aborted (loop 1, pass 5): of another loop",
-    ]
-    lines = mapek("log", log, "--events", "--json", "--pass", "5", "--loop", "0").out.splitlines()
-    events = [json.loads(line)["event"] for line in lines if line.startswith('{"event"')]
-    assert [(event["kind"], event["pass"]) for event in events] == [("joined", None), ("aborted", 5)]
-    assert set(events[0]) == {"number", "time", "role", "kind", "loop", "pass", "text"}
+    outcome = mapek("log", "log.sqlite", *options)
+    assert (outcome.code, outcome.out) == (1, "")
+    assert "log.sqlite holds no record yet; --follow waits" in outcome.err
+
+
+def test_passes_that_an_unfinished_log_does_not_reach_are_said_to_be_missing(mapek: Mapek, log: Path) -> None:
+    with Store(log / "log.sqlite") as store:
+        store._db.execute("DELETE FROM records WHERE pass > 5")
+
+    outcome = mapek("log", log, "--pass", "7:9")
+    assert (outcome.code, outcome.out) == (1, "")
+    assert "holds no such record" in outcome.err
 
 
 def test_an_unfinished_log_is_told_as_far_as_it_goes(mapek: Mapek, log: Path) -> None:
@@ -250,6 +329,56 @@ def test_follow_ends_after_the_passes_that_are_wanted(mapek: Mapek, log: Path, m
         outcome = mapek("log", log / "growing.sqlite", "--follow", "--pass", "2:3", "--json")
 
     assert outcome.out.splitlines() == bodies(log)[5:13]
+
+
+class Appearing:
+    """A folder, and in it a log, that come into being while the reader waits."""
+
+    def __init__(self, whole: Path, folder: Path) -> None:
+        self._steps: deque[Callable[[], object]] = deque(
+            [lambda: None, folder.mkdir, lambda: shutil.copy(whole, folder / "log.sqlite")]
+        )
+
+    def sleep(self, seconds: float) -> None:
+        assert self._steps, "the reader waits for more than there is"
+        self._steps.popleft()()
+
+
+def test_follow_waits_for_a_folder_and_for_the_log_in_it(
+    mapek: Mapek, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adapters.cli.log.time", Appearing(log / "log.sqlite", log.parent / "later"))
+
+    outcome = mapek("log", "later", "--follow", "--json")
+
+    assert (outcome.code, outcome.err) == (0, "waiting for the log of later\n")
+    assert outcome.out.splitlines() == bodies(log)
+
+
+def test_follow_tells_what_happens_while_no_record_comes(
+    mapek: Mapek, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store(log / "growing.sqlite") as store:
+        ledger = begin(store, CONFIG)
+        records = records_of(log / "log.sqlite")
+        for record in records[:-4]:
+            take(ledger, record)
+        ledger.commit()
+        growing = Growing(ledger, records[-4:], 4)
+        said: list[str] = []
+
+        def sleep(seconds: float) -> None:
+            if not said:
+                said.append("first")
+                ledger.note("plan", "joined", "epoch 2")
+                ledger.commit()
+            else:
+                growing.sleep(seconds)
+
+        monkeypatch.setattr("adapters.cli.log.time", SimpleNamespace(sleep=sleep))
+        lines = mapek("log", log / "growing.sqlite", "--follow", "--json", "--events").out.splitlines()
+
+    assert [place for place, line in enumerate(lines) if line.startswith('{"event"')] == [len(lines) - 5]
 
 
 def test_ctrl_c_ends_following_with_130(log: Path) -> None:

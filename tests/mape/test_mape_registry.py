@@ -113,7 +113,7 @@ def test_an_unknown_short_name_is_asked_back_with_the_way_to_ones_own():
 
 @pytest.mark.parametrize("name", ["no_such_module:Class", "mape.monitor.none:Class", "mape.none.more:Class"])
 def test_an_unknown_module_is_named(name):
-    with pytest.raises(UnknownName, match="There is no module"):
+    with pytest.raises(ConfigError, match=rf"detector '{name}': there is no module '\S+' in this folder"):
         registry.find("detector", name)
 
 

@@ -1,6 +1,9 @@
 """One SQLite file per run: what it holds, who may open it, and what it lets go."""
 
+import hashlib
+import json
 import sqlite3
+import struct
 import subprocess
 import sys
 import textwrap
@@ -265,6 +268,15 @@ def test_a_q_table_comes_back_as_the_same_bits(store):
     assert (again.actions, again.values.tobytes()) == (table.actions, table.values.tobytes())
     assert key == table.sha256() == again.sha256()
     assert store.table("0" * 64) is None
+
+
+def test_the_hash_of_a_q_table_is_made_as_the_schema_says(store, path):
+    store.keep_table(table_of(7.0), remembered=True)
+    store.commit()
+    ((key, actions, states, body),) = by_sqlite(path, "SELECT sha256, actions, states, body FROM q_tables")
+    ids = json.loads(actions)
+    rows = len(ids)
+    assert key == hashlib.sha256(struct.pack(f"<{2 + rows}q", rows, states, *ids) + body).hexdigest()
 
 
 def test_a_state_comes_back_with_its_q_table(store):
