@@ -21,7 +21,7 @@ from adapters.buses.inbox import Inbox
 from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout
 from adapters.buses.outbox import Outbox
 from adapters.buses.questions import Questions, Refused
-from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Wire, hand_over, host, role_of
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Unanswered, Wire, hand_over, host, role_of
 from adapters.roles import STAGE_OF
 from knowledge import MalformedRecord, Record, to_json
 from mape.errors import BusError
@@ -145,11 +145,11 @@ class Member(Questions):
         while True:
             try:
                 return self.wire.join(self.role, 0.5)
-            except BusError as error:
+            except Unanswered as error:
                 if deadline is not None and time.monotonic() > deadline:
                     raise
-                trusted = "" if self.wire.tls is None else f" ({error})"
-                self._say(f"waiting for Knowledge on {self.wire.endpoint}{trusted}")
+                why = f" ({error})" if error.listens else ""
+                self._say(f"waiting for Knowledge on {self.wire.endpoint}{why}")
 
     def _join(self, deadline: float | None) -> None:
         join = Join(
@@ -158,7 +158,8 @@ class Member(Questions):
         ).pack()  # fmt: skip
         pause = threading.Event()
         while True:
-            self.joined, _ = Joined.unpack(self.ask(f"join/{self.role}", join, deadline=deadline))
+            # One of another system is asked too: it refuses this role, and says what differs.
+            self.joined, _ = Joined.unpack(self.ask(f"join/{self.role}", join, deadline=deadline, any_system=True))
             if self.joined.layout is not None:
                 break
             if deadline is not None and time.monotonic() > deadline:

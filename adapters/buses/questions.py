@@ -54,9 +54,15 @@ class Questions(ABC):
             self._tell(sentence)
 
     def ask(
-        self, what: str, payload: bytes | None = None, attachment: bytes | None = None, deadline: float | None = None
+        self,
+        what: str,
+        payload: bytes | None = None,
+        attachment: bytes | None = None,
+        deadline: float | None = None,
+        *,
+        any_system: bool = False,
     ) -> bytes:
-        """Ask Knowledge, again until it answers.
+        """Ask Knowledge, again until it answers; with `any_system` the one that is there, of whatever system it is.
 
         Raises
         ------
@@ -71,13 +77,14 @@ class Questions(ABC):
             raise BusError(f"{self.role} is not connected; call connect()")
         if deadline is None and self.patience is not None:
             deadline = time.monotonic() + self.patience
+        key = self.wire.ask_any(what) if any_system else self.wire.ask(what)
         pause, tick = 0.005, threading.Event()
         while True:
             # Nobody there, a hub that fell over the question, and one that is just restarting look the same: no reply.
             # To ask again is safe, as Knowledge takes everything once.
             outcome = "no reply"
             for reply in self._session.get(
-                self.wire.ask(what), payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
+                key, payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
             ):
                 if reply.ok is not None:
                     self._deaf_since = None

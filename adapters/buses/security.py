@@ -146,7 +146,7 @@ def tls(folder: Path, role: str) -> dict[str, Any]:
     if role not in ROLES:
         raise UnknownName("role", role, ROLES)
     folder = folder.absolute()  # Zenoh's paths are relative to the folder in which the process stands
-    authority, certificate, key = folder / f"{AUTHORITY}.pem", folder / f"{role}.pem", folder / f"{role}.key"
+    authority, certificate, key = authority_of(folder), folder / f"{role}.pem", folder / f"{role}.key"
     for path in (authority, certificate, key):
         _check_readable(path)
     _check_certificates(authority, certificate, key, role)
@@ -162,6 +162,32 @@ def tls(folder: Path, role: str) -> dict[str, Any]:
             "close_link_on_expiration": True,
         },
     }
+
+
+def authority_of(folder: Path) -> Path:
+    """Return the file of the authority's certificate."""
+    return folder.absolute() / f"{AUTHORITY}.pem"
+
+
+def check_host(folder: Path, host: str) -> None:
+    """Look whether Knowledge's certificate is good for being reached as `host`, a name or an address.
+
+    Raises
+    ------
+    ConfigError
+        It names others, or does not hold.
+    """
+    server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    server.load_cert_chain(folder / f"{KNOWLEDGE}.pem", folder / f"{KNOWLEDGE}.key", password="")
+    client.load_verify_locations(authority_of(folder))
+    try:
+        _shake_hands(server, client, host)
+    except ssl.SSLCertVerificationError as error:
+        raise ConfigError(
+            f"{folder / f'{KNOWLEDGE}.pem'} does not let {KNOWLEDGE} be reached as {host} "
+            f"({error.verify_message.rstrip('.')}). Listen where it does, such as on 127.0.0.1; or renew it where "
+            f"{AUTHORITY}.key is: `mapek keys {folder} --renew {KNOWLEDGE} --host {host}`."
+        ) from error
 
 
 def _check_readable(path: Path) -> None:
@@ -222,10 +248,13 @@ def _check_certificates(authority: Path, certificate: Path, key: Path, role: str
 _NO_CHECK_TIME = ssl.VerifyFlags(0x200000)
 
 
-def _shake_hands(server: ssl.SSLContext, client: ssl.SSLContext) -> dict[ssl.SSLContext, Any]:
-    """Return the certificate that each side has seen of the other."""
+def _shake_hands(server: ssl.SSLContext, client: ssl.SSLContext, host: str | None = None) -> dict[ssl.SSLContext, Any]:
+    """Return the certificate that each side has seen of the other; the client asks for `host`, if for anybody."""
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-    ends = (client.wrap_bio(to_client, to_server), server.wrap_bio(to_server, to_client, server_side=True))
+    ends = (
+        client.wrap_bio(to_client, to_server, server_hostname=host),
+        server.wrap_bio(to_server, to_client, server_side=True),
+    )
     for _ in range(4):
         for end in ends:
             with contextlib.suppress(ssl.SSLWantReadError):

@@ -24,6 +24,7 @@ import json
 import os
 import re
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -31,8 +32,8 @@ from typing import Any
 
 import zenoh
 
-from adapters.buses import security
-from adapters.roles import ROLES
+from adapters.buses import endpoints, security
+from adapters.roles import KNOWLEDGE, OPERATOR, ROLES
 from knowledge import STAGES, ChangePlan, ChangeRequest, Observation, Record, Symptom
 from mape.errors import BusError, ConfigError
 
@@ -66,9 +67,14 @@ LEASE_MS = 2_000
 """After that long a process that is frozen, or cut off, is taken for gone; one that died is seen at once."""
 
 _SEGMENT = re.compile(r"[a-z0-9_-]+")
-_UNIX = "unixsock-stream/"
-_NET = re.compile(r"(?:tcp|tls)/(?P<host>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):(?P<port>\d{1,5})")
-_LOOPBACK = re.compile(r"127(?:\.\d{1,3}){3}|localhost|\[::1\]")
+
+
+class Unanswered(BusError):
+    """Nobody can be joined at an endpoint; `listens` tells whether somebody listens there all the same."""
+
+    def __init__(self, said: str, listens: bool) -> None:
+        super().__init__(said)
+        self.listens = listens
 
 
 @dataclass(frozen=True)
@@ -106,8 +112,8 @@ class Wire:
     def __post_init__(self) -> None:
         if self.system != "*":
             segment(self.system, "the system's name")
-        _check_endpoint(self.endpoint, self.tls is not None or self.insecure)
-        if self.tls is not None and self.endpoint.startswith(_UNIX):
+        endpoints.check_endpoint(self.endpoint, self.tls is not None or self.insecure)
+        if self.tls is not None and self.endpoint.startswith(endpoints.UNIX):
             raise ConfigError(f"endpoint {self.endpoint!r} takes no keys; with --tls give tcp/HOST:PORT")
 
     def stream(self, role: str, loop: int | str = "*") -> str:
@@ -122,6 +128,10 @@ class Wire:
         """Key of a question to Knowledge."""
         return f"mape/{self.system}/knowledge/{what}"
 
+    def ask_any(self, what: str) -> str:
+        """Key of a question to Knowledge, of whatever system it is."""
+        return f"mape/*/knowledge/{what}"
+
     def control(self, role: str) -> str:
         """Key of a question to a role."""
         return f"mape/{self.system}/control/{role}"
@@ -134,50 +144,85 @@ class Wire:
         """Key of a role's liveliness token: each start has its own, so a restart is not taken for a return."""
         return f"mape/{self.system}/alive/{role}/{epoch}"
 
-    def listen(self) -> zenoh.Session:
-        """Open the meeting point: a router on the endpoint.
+    def check_listen(self) -> None:
+        """Look whether `listen` would find its endpoint free and its keys in place.
 
         Raises
         ------
         BusError
             The endpoint is taken, or cannot be made.
         ConfigError
-            A certificate is missing, or of no use.
+            A certificate is missing, or of no use; or a file that is no socket stands at the endpoint's path.
         """
-        edges: dict[str, Any] = {"listen": {"endpoints": [self._address()]}}
+        if self.tls is not None:
+            security.tls(self.tls, KNOWLEDGE)
+        endpoints.check_free(self.endpoint)
+
+    def check_here(self) -> None:
+        """Look whether all processes of a run can meet on this machine: `check_listen`, and the others' keys.
+
+        Raises
+        ------
+        BusError, ConfigError
+            As `check_listen`; or with keys nobody would reach the endpoint, as Knowledge's certificate does not name
+            it.
+        """
+        place = endpoints.place_of(endpoints.reached(self.endpoint, self.tls is not None))
+        self.check_listen()
+        if self.tls is not None and place is not None:
+            for role in (*ROLES, OPERATOR):
+                security.tls(self.tls, role)
+            security.check_host(self.tls, place[0])
+
+    def listen(self) -> zenoh.Session:
+        """Open the meeting point: a router on the endpoint.
+
+        Raises
+        ------
+        BusError, ConfigError
+            As `check_listen`.
+        """
+        self.check_listen()
+        edges: dict[str, Any] = {"listen": {"endpoints": [self._address(self.endpoint)]}}
         if self.tls is not None:
             edges["access_control"] = security.access_control()
             security.log_refusals()
-        return never_freed(
-            _open(
-                self._config("router", "knowledge", **edges),
-                f"cannot listen on {self.endpoint}; is another Knowledge running there?",
-            )
-        )
+        taken = f"cannot listen on {self.endpoint}; is another Knowledge running there?"
+        router = _open(self._config("router", KNOWLEDGE, **edges), lambda said: BusError(f"{taken} ({said})"))
+        return never_freed(router)
 
     def join(self, role: str, patience: float) -> zenoh.Session:
         """Open a client's session, waiting up to `patience` seconds for the meeting point.
 
+        An endpoint that stands for all addresses of a machine is reached on this one.
+
         Raises
         ------
-        BusError
-            Nobody listens on the endpoint, or it refuses this role's certificate.
+        Unanswered
+            Nobody listens on the endpoint, or who does refuses this role's certificate, or has none.
         ConfigError
-            A certificate is missing, or of no use.
+            A certificate is missing, or of no use; or the endpoint cannot be reached with keys.
         """
+        endpoint = endpoints.reached(self.endpoint, self.tls is not None)
         connect = {
-            "endpoints": [self._address()],
+            "endpoints": [self._address(endpoint)],
             "timeout_ms": max(1, round(patience * 1000)),
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
         }
-        otherwise = f"no Knowledge answers on {self.endpoint}; start it, or look at the address"
-        if self.tls is not None:
-            otherwise += f" and at whether it trusts the certificate of {role} in {self.tls}"
-        return _open(self._config("client", role, connect=connect), otherwise)
+        return _open(self._config("client", role, connect=connect), lambda said: self._unanswered(endpoint, role, said))
 
-    def _address(self) -> str:
-        return self.endpoint if self.tls is None else self.endpoint.replace("tcp/", "tls/", 1)
+    def _unanswered(self, endpoint: str, role: str, said: str) -> Unanswered:
+        place, found = endpoints.place_of(endpoint), None
+        if place is not None:
+            found = endpoints.who_listens(place, None if self.tls is None else security.authority_of(self.tls))
+        why = found or "start it, or look at the address"
+        if self.tls is not None and not found:
+            why += f" and at whether it trusts the certificate of {role} in {self.tls}"
+        return Unanswered(f"no Knowledge answers on {self.endpoint}; {why} ({said})", found is not None)
+
+    def _address(self, endpoint: str) -> str:
+        return endpoint if self.tls is None else endpoint.replace("tcp/", "tls/", 1)
 
     def _config(self, mode: str, role: str, **edges: Any) -> zenoh.Config:
         quiet = {"enabled": False}
@@ -249,28 +294,6 @@ def host() -> str:
     return socket.gethostname()[:255]
 
 
-def _check_endpoint(endpoint: str, anywhere: bool) -> None:
-    if endpoint.startswith(_UNIX):
-        path = endpoint.removeprefix(_UNIX)
-        if not path or re.search(r"[?#;]", path):
-            raise ConfigError(f"endpoint {endpoint!r} needs a path without ?, # and ; after {_UNIX}")
-        if (size := len(os.fsencode(path))) >= 108:
-            raise ConfigError(f"the socket's path {path!r} has {size} bytes; the kernel takes fewer than 108")
-        return
-    found = _NET.fullmatch(endpoint)
-    if found is None or not 1 <= int(found["port"]) <= 65_535:
-        raise ConfigError(
-            f"endpoint {endpoint!r} is neither {_UNIX}PATH nor tcp/HOST:PORT with a port from 1 to 65535, such as "
-            "tcp/127.0.0.1:7447"
-        )
-    if not anywhere and not _LOOPBACK.fullmatch(found["host"]):
-        raise ConfigError(
-            f"endpoint {endpoint!r} can be reached from other machines, and without keys nobody proves who they are. "
-            "Make keys with `mapek keys DIR` and give --tls DIR; or stay on 127.0.0.1; or, where the network itself is "
-            "trusted, give --insecure"
-        )
-
-
 _RUNTIME = "(net: (handover: app), acc: (handover: app), app: (worker_threads: 1))"
 """Zenoh hands each message from one pool of threads to the next, and these wake-ups cost more than all else.
 
@@ -279,7 +302,7 @@ reading it.
 """
 
 
-def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:
+def _open(config: zenoh.Config, otherwise: Callable[[str], BusError]) -> zenoh.Session:
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read once, when the first session of a process is opened
     # Zenoh says nowhere else that it has closed a link.
     zenoh.init_log_from_env_or("error")
@@ -287,7 +310,7 @@ def _open(config: zenoh.Config, otherwise: str) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         # Of what Zenoh says, the places in its sources help nobody here.
-        raise BusError(f"{otherwise} ({re.split(r'[.]? at /', str(error))[0]})") from error
+        raise otherwise(re.split(r"[.]? at /", str(error))[0]) from error
 
 
 def never_freed(router: zenoh.Session) -> zenoh.Session:

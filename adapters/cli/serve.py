@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import sys
+import threading
 from pathlib import Path
 
 from adapters.buses.wire import Wire, system_segment
@@ -27,16 +28,15 @@ def execute(chosen: argparse.Namespace) -> int:
     prepare()
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(asctime)s %(levelname)s %(message)s")
     logging.getLogger("adapters").setLevel(logging.INFO)  # ours alone: who draws the figures has much to say
-    if chosen.leash:
-        leash()
+    released = leash() if chosen.leash else None
     try:
         with terminated_by_signal():
-            return _serve(chosen)
+            return _serve(chosen, released)
     except Terminated:
         return 143
 
 
-def _serve(chosen: argparse.Namespace) -> int:
+def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
     config = config_of(chosen.config, chosen, chosen.agent)
     knowledge = chosen.role == "knowledge"
     endpoint, wrong = (chosen.listen, chosen.connect) if knowledge else (chosen.connect, chosen.listen)
@@ -50,7 +50,7 @@ def _serve(chosen: argparse.Namespace) -> int:
     if tls is not None:
         _keep_standard_output()
     if not knowledge:
-        serve_role(config, chosen.role, wire)
+        serve_role(config, chosen.role, wire, released)
         return 0
     kept = {"durability": chosen.durability, "snapshot_every": chosen.snapshot_every}
     if chosen.log is not None:  # somebody else makes the tables
@@ -74,6 +74,7 @@ def _serve_with_results(chosen: argparse.Namespace, config: Config, wire: Wire, 
     from adapters.cli import up
 
     label = chosen.agent or config.name
+    wire.check_listen()  # no folder is begun by who cannot listen
     with open_folder(chosen, "up", config.name, {label: config}, check=lambda config: None) as folder:
         serve_knowledge(config, wire, folder.path / LOG_NAME, **kept)  # type: ignore[arg-type]
         up.conclude(chosen, config, label, folder)

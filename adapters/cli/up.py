@@ -12,6 +12,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from adapters.buses.endpoints import check_endpoint
 from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, finish, open_folder, prepare, say
 from adapters.cli.run import as_json, report
@@ -19,12 +20,13 @@ from adapters.cli.sentences import sentence
 from adapters.experiments.runner import check
 from adapters.processes.export import export
 from adapters.processes.serve import Terminated, open_ledger, terminated_by_signal
-from adapters.processes.supervise import Supervisor, command_of
+from adapters.processes.supervise import Failed, Supervisor, command_of
 from adapters.results import RunFolder
 from adapters.roles import KNOWLEDGE, ROLES
 from adapters.stores import LOG_NAME, Swap
 from knowledge import from_json
 from mape.config import Config
+from mape.errors import ConfigError
 from mape.trials import TrialResult
 
 
@@ -42,9 +44,15 @@ def _run(chosen: argparse.Namespace) -> int:
     config = config_of(chosen.config, chosen, chosen.agent)
     label = chosen.agent or config.name
     with contextlib.ExitStack() as opened:
+        if chosen.tls is not None and chosen.listen is None:
+            raise ConfigError(
+                "the processes of `mapek up` meet on a socket of your own, which takes no keys; with --tls say where "
+                "on the network they do, such as --listen tcp/127.0.0.1:7447"
+            )
         endpoint = chosen.listen or _own_endpoint(opened)
         tls = None if chosen.tls is None else Path(chosen.tls)
         wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure)
+        wire.check_here()
         folder = opened.enter_context(open_folder(chosen, "up", config.name, {label: config}, check=_check))
         try:
             _drive(chosen, config, label, wire, folder)
@@ -53,6 +61,8 @@ def _run(chosen: argparse.Namespace) -> int:
             code = 130 if isinstance(stop, KeyboardInterrupt) else 143
             say(chosen, f"stopped. All that was logged is kept; `mapek resume {folder.path}` continues.")
             return code
+        except Failed as failed:
+            raise Failed(_with_way_on(str(failed), folder)) from failed
     return 0
 
 
@@ -77,10 +87,22 @@ def conclude(chosen: argparse.Namespace, config: Config, label: str, folder: Run
     finish(chosen, folder, result, figures)
 
 
+def _with_way_on(said: str, folder: RunFolder) -> str:
+    """Add to what a process said how the run is continued; who writes the log says so itself, and knows no folder."""
+    named = said.replace("`mapek resume`", f"`mapek resume {folder.path}`")
+    return named if named != said else f"{said} {folder.kept()}"
+
+
 def _own_endpoint(opened: contextlib.ExitStack) -> str:
-    # A socket in a folder that only this user can enter; its path has to be short.
-    folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mapek-"))
-    return f"unixsock-stream/{folder}/k.sock"
+    # A socket in a folder that only this user can enter. Its path has to be short, and to have nothing in it that means
+    # something in an endpoint; what is named by TMPDIR may be neither.
+    for place in (None, "/tmp"):
+        folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mapek-", dir=place))
+        endpoint = f"unixsock-stream/{folder}/k.sock"
+        with contextlib.suppress(ConfigError):
+            check_endpoint(endpoint, anywhere=False)
+            return endpoint
+    raise ConfigError(f"no socket can be made in {folder}; say where the processes meet: --listen tcp/127.0.0.1:7447")
 
 
 def _check(config: Config) -> object:
@@ -125,6 +147,11 @@ def _collect(config: Config, label: str, folder: RunFolder) -> tuple[list[TrialR
     return results, live
 
 
+def _waiting(supervisor: Supervisor) -> str:
+    why = supervisor.why_waiting()
+    return f"waiting ({why.rstrip('.')})" if why else "waiting"
+
+
 class Screen:
     """What one sees of a run: a table that is drawn anew on a terminal, elsewhere a line now and then."""
 
@@ -164,7 +191,7 @@ class Screen:
             self._seen.append((now, passes))
         (then, before), (here, after) = self._seen[0], self._seen[-1]
         rate = (after - before) / (here - then) if here > then else 0.0
-        left = f"{(self._total - passes) / rate:,.0f} s left" if rate > 0 else "waiting"
+        left = f"{(self._total - passes) / rate:,.0f} s left" if rate > 0 else _waiting(supervisor)
         if self._live is not None:
             self._live.update(self._table(supervisor, f"{passes:,} of {self._total:,} passes, {rate:,.0f}/s, {left}"))
             self._live.refresh()

@@ -65,6 +65,8 @@ class Role(Replacing):
         self.member = member
         self.units: list[Unit] = []
         self.stopping = threading.Event()
+        self.released = threading.Event()  # until then it is made, and does not join
+        self.released.set()
 
     def run(self) -> None:
         """Join, restore, and work until all loops are done, or `stopping` is set.
@@ -74,6 +76,7 @@ class Role(Replacing):
         MapekError
             A part or the system raised, or Knowledge refuses this role.
         """
+        self.released.wait()
         with self.member:
             self.begin()
             while not self.stopping.is_set() and not all(unit.done for unit in self.units):

@@ -21,7 +21,7 @@ from adapters.buses.wire import Wire, versions
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
 from mape.config import Config
-from mape.errors import ResultsError
+from mape.errors import PartError, ResultsError
 
 logger = logging.getLogger(__name__)
 
@@ -61,17 +61,25 @@ def terminated_by_signal() -> Iterator[None]:
         sys.unraisablehook = hook
 
 
-def leash() -> None:
-    """End this process when the one that started it is gone: its standard input then ends."""
+def leash() -> threading.Event:
+    """End this process when the one that started it is gone: its standard input then ends.
+
+    Returns
+    -------
+    threading.Event
+        Set when a line has come: the other one lets this one join its run.
+    """
+    released = threading.Event()
 
     def watch() -> None:
         # The descriptor itself: a thread that waits in `sys.stdin` would abort the interpreter's exit.
         with contextlib.suppress(OSError):
             while os.read(0, 4096):
-                pass
+                released.set()
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, name="leash", daemon=True).start()
+    return released
 
 
 def quick_switches() -> None:
@@ -126,8 +134,15 @@ def serve_knowledge(
         ledger.store.close()
 
 
-def serve_role(config: Config, role: str, wire: Wire) -> None:
+def serve_role(config: Config, role: str, wire: Wire, released: threading.Event | None = None) -> None:
     """Be one of the roles until the run is complete.
+
+    Parameters
+    ----------
+    config, role, wire
+        What runs, which role it is, and where Knowledge listens.
+    released
+        Once it is set this role joins; None where it may at once.
 
     Raises
     ------
@@ -148,4 +163,11 @@ def serve_role(config: Config, role: str, wire: Wire) -> None:
             waiting=lambda sentence: print(f"{role}: {sentence}", file=sys.stderr, flush=True),  # noqa: T201
         )
 
-    make_role(role, config, member_of).run()
+    try:
+        made = make_role(role, config, member_of)
+        if released is not None:
+            made.released = released
+        made.run()
+    except SystemExit as stop:
+        # It would end this process as if all were done, or with a code that means something else.
+        raise PartError(f"{role} failed: a part or the system of the config called sys.exit({stop.code!r})") from stop

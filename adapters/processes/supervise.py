@@ -3,11 +3,15 @@
 Who died by a signal is started again at once. Who ended with an error gets one more try, for the error may have been
 the world's; where it comes again at the same place, the run ends with it. Who is alive and says nothing for too long is
 hung: it is killed, and started again.
+
+All are started at once, and the roles hold until Knowledge, the one that was started here, has answered: at the same
+place there may be that of another run.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -43,6 +47,9 @@ CRASHES = 10
 FRESH = 3.0
 """Seconds for which Knowledge's word on who is hung is believed."""
 
+TOLD_AFTER = 5.0
+"""Seconds after its start after which it is told that Knowledge cannot be reached."""
+
 STOPPED_AFTER = LEASE_MS / 1000
 """Seconds from one look at the clock to the next after which this process is taken to have been stopped, as by Ctrl-Z.
 
@@ -68,6 +75,8 @@ class Child:
         self.errors = 0
         self.hung = 0
         self.killed = False  # it may take a moment until it is gone
+        self.released = False
+        self.left_at: float | None = None  # when it was seen to have ended without an error
         self.done = False
 
     @property
@@ -89,8 +98,17 @@ class Child:
                 self.command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
             )
         self.starts += 1
-        self.killed = False
+        self.killed = self.released = False
+        self.left_at = None
         self.started_at = time.monotonic()
+
+    def release(self) -> None:
+        """Let it join; the time that it has for its start begins here."""
+        if not self.released and self.process is not None and self.process.stdin is not None:
+            self.released = True
+            self.started_at = time.monotonic()
+            with contextlib.suppress(BrokenPipeError):
+                os.write(self.process.stdin.fileno(), b"\n")  # unbuffered: nothing is left for `close`
 
     def end(self) -> None:
         """Ask it to end."""
@@ -154,6 +172,9 @@ class Supervisor:
         self.tell = tell
         self.children = {role: Child(role, command, logs / f"{role}.log") for role, command in commands.items()}
         self.status: Status | None = None
+        self._status_of = 0.0  # when it was asked for
+        self._unreached = ""
+        self._told_unreached = False
         self._heard_at = 0.0
         self._asked_at = 0.0
         self._awake_at = 0.0
@@ -194,6 +215,8 @@ class Supervisor:
             self._ask()  # first: what one knows from before a stop is nothing to judge by
             for child in self.children.values():
                 self._look_at(child)
+                if self._heard_at and child.role != KNOWLEDGE:
+                    child.release()
             tell(self)
             time.sleep(LOOK_EVERY)  # a child may die, or Knowledge be silent: no one event tells of both
 
@@ -207,25 +230,39 @@ class Supervisor:
                 self._is_hung(child)
             return
         if code == 0:
-            child.done = True
-            return
+            child.left_at = child.left_at or time.monotonic()
+            child.done = self._has_made_its_part(child)
+            if child.done or self._status_of <= child.left_at:
+                return  # in the second case, Knowledge is still to say
         if code == 2:
             raise ConfigError(_last_sentence(child))
         now = time.monotonic()
         child.deaths.append((now, self._passes))
-        if code > 0:
+        if code >= 0:
             child.errors += 1
             if child.errors > 1 and child.deaths[-2][1] == self._passes:
-                raise Failed(
-                    f"{child.role} failed twice at the same place: {_last_sentence(child)} What was acknowledged is "
-                    "kept."
-                )
+                raise Failed(f"{child.role} failed twice at the same place: {self._failure(child, code)}")
         if len(child.deaths) == CRASHES and child.deaths[0][1] == self._passes:
             raise Failed(
                 f"{child.role} died {CRASHES} times within {now - child.deaths[0][0]:.0f} s, without a pass in between "
-                f"({self._why(child, code)}): {_last_sentence(child)} What was acknowledged is kept."
+                f"({self._why(child, code)}): {_last_sentence(child)}"
             )
         child.start()
+
+    def _has_made_its_part(self, child: Child) -> bool:
+        """Whether a child that ended without an error was to end; Knowledge does only when all is complete."""
+        if child.role == KNOWLEDGE or self.children[KNOWLEDGE].done:
+            return True
+        status = self.status
+        return status is not None and status.roles[child.role].last_pass >= status.episodes
+
+    @staticmethod
+    def _failure(child: Child, code: int) -> str:
+        said = _last_sentence(child)
+        if code == 0:
+            last = f" Its last words: {said}" if child.said().strip() else ""
+            return f"it ended as if all were done, as code does that exits by itself.{last}"
+        return said
 
     def _why(self, child: Child, code: int) -> str:
         if child.hung:
@@ -247,6 +284,9 @@ class Supervisor:
             if spoke:
                 silent = min(silent, role.beat_age or 0.0)
         if silent > (self.hang_after if spoke else max(self.hang_after, STARTS_WITHIN)):
+            if child.role == KNOWLEDGE and child.hung and not self._heard_at:
+                why = self._unreached or "it does not answer"
+                raise Failed(f"{KNOWLEDGE} runs, and cannot be reached: {_sentence(why)}")
             child.hung += 1
             child.killed = True
             self.tell(
@@ -254,24 +294,46 @@ class Supervisor:
             )
             child.kill()
 
+    def why_waiting(self) -> str:
+        """Say for what the run waits, as far as that is known."""
+        if not self._heard_at:
+            return self._unreached
+        for role, child in self.children.items():
+            joined = None if self.status is None else self.status.roles.get(role)
+            if joined is not None and not joined.alive and not child.done and child.said():
+                return f"{role}: {_last_sentence(child)}"
+        return ""
+
     def _ask(self) -> None:
         now = self._now()
-        if now - self._asked_at < STATUS_EVERY:
+        if self._heard_at and now - self._asked_at < STATUS_EVERY:
             return
         self._asked_at = now
+        found: list[Status] = []
         try:
             if self._operator is None:
                 self._operator = self.wire.join(OPERATOR, 0.2)
             found = ask_status(self._operator, self.wire, 0.5)
-        except BusError:
+            self._unreached = f"another Knowledge answers on {self.wire.endpoint}" if found else ""
+        except BusError as error:
+            self._unreached = str(error)
+        ours = [status for status in found if status.pid == self.children[KNOWLEDGE].pid]
+        if not ours:
+            self._tell_unreached(now)
             return
-        if found:
-            self.status = found[0]
-            self._heard_at = self._now()
-            if self.status.passes > self._passes:
-                self._passes = self.status.passes
-                for child in self.children.values():
-                    child.errors = 0
+        self.status = ours[0]
+        self._status_of = now
+        self._heard_at = self._now()
+        if self.status.passes > self._passes:
+            self._passes = self.status.passes
+            for child in self.children.values():
+                child.errors = 0
+
+    def _tell_unreached(self, now: float) -> None:
+        started = self.children[KNOWLEDGE].started_at
+        if self._unreached and not self._heard_at and not self._told_unreached and now - started > TOLD_AFTER:
+            self._told_unreached = True
+            self.tell(f"waiting since {now - started:.0f} s: {self._unreached}")
 
     def _now(self) -> float:
         now = time.monotonic()
@@ -301,6 +363,10 @@ def _last_sentence(child: Child) -> str:
     lines = [line for line in child.said().splitlines() if line.strip()]
     told = [line.removeprefix("mapek: ") for line in lines if line.startswith("mapek: ")]
     text = told[-1] if told else (lines[-1] if lines else "it said nothing")
+    return _sentence(text)
+
+
+def _sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
