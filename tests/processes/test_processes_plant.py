@@ -55,7 +55,7 @@ class Redrivable(Plant):
         return self.left, 1.0, self.left == 0, False, {}
 
 
-gymnasium.register("Plant-v0", Plant, max_episode_steps=3)
+gymnasium.register("Pump-v0", Plant, max_episode_steps=3)
 gymnasium.register("Redrivable-v0", Redrivable, max_episode_steps=3)
 
 
