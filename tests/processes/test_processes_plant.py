@@ -66,7 +66,7 @@ def fresh(monkeypatch):
     monkeypatch.setattr(Plant, "turned", 0)
 
 
-def plant(episodes, name="Plant", **over):
+def plant(episodes, name="Pump", **over):
     table = {
         "episodes": episodes,
         "system": {"id": f"{name}-v0"},
