@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mape_interrupts import stopped_by_ctrl_c
 from mape_runs import GRID, TRAFFIC, config, hashes, loop_of
 
 import knowledge
@@ -31,26 +32,6 @@ def block(stream, passes):
 def blocks():
     stream = Uniforms(7, (0, 1), WIDTH)
     return [block(stream, passes) for passes in range(PASSES)]
-
-
-def stopped_by_ctrl_c(call, code, line):
-    """Call, with a KeyboardInterrupt before the line number `line`, of those made, of a function; say if it has one."""
-    lines = itertools.count()
-
-    def trace(frame, event, _):
-        if event == "line" and next(lines) == line:
-            raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(lambda frame, event, _: trace if frame.f_code is code else None)
-    try:
-        call()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.settrace(before)
-    return False
 
 
 def test_blocks_are_found_in_any_order(blocks):

@@ -2,9 +2,9 @@
 
 import itertools
 import json
-import sys
 
 import pytest
+from mape_interrupts import stopped_by_ctrl_c
 from mape_runs import Corridor, config, corridor_loop, hashes, loop_of
 
 from knowledge import ChangePlan, Knowledge, Log, QTable
@@ -12,27 +12,6 @@ from mape.config import from_table
 from mape.errors import ManagedSystemError, PartError
 from mape.execute import component, episode
 from mape.loop import build_execute, layout_of
-
-
-def broken_off(call, code, line):
-    """Call, with a KeyboardInterrupt before the line number `line`, of those made, of a function; say if it has one."""
-    lines = itertools.count()
-
-    def trace(frame, event, _):
-        if event == "line" and next(lines) == line:
-            raise KeyboardInterrupt
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(lambda frame, event, _: trace if frame.f_code is code else None)
-    try:
-        call()
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.settrace(before)
-    return False
-
 
 # An interrupt does not un-learn what is learnt
 
@@ -49,7 +28,7 @@ def test_an_interrupt_on_the_way_to_an_episode_leaves_the_one_before_learnt(engi
     for line in itertools.count():
         loop = loop_of(config(**SMALL, execute={"engine": engine}))
         loop.run(3)
-        if not broken_off(loop.execute.drive, component.Execute.drive.__code__, line):
+        if not stopped_by_ctrl_c(loop.execute.drive, component.Execute.drive.__code__, line):
             break
         assert loop.execute.q_table.sha256() in learnt
     assert line > 10
@@ -60,7 +39,7 @@ def test_after_an_interrupt_of_an_episode_it_is_driven_again_to_the_same_bits(li
     whole, loop = (loop_of(config(**SMALL, execute={"engine": "python"})) for _ in range(2))
     whole.run(8)
     loop.run(3)
-    assert broken_off(loop.execute.drive, episode.episode.__code__, line)
+    assert stopped_by_ctrl_c(loop.execute.drive, episode.episode.__code__, line)
     loop.run(5)
     assert hashes(loop) == hashes(whole)
 
