@@ -136,7 +136,10 @@ def test_one_that_was_frozen_for_longer_than_the_lease_goes_on_where_it_was(endp
             execute.send(observation(number))
         execute.settle(10)
         code, out, err = ended(process)
-        assert (code, err) in {(0, ""), (0, "monitor hears nothing from Knowledge, and opens another session\n")}
+        assert code == 0, err
+        # A publication that was under way may come torn; it is ignored, and fetched.
+        said = ("monitor hears nothing from Knowledge, and opens another session", "monitor ignores mape/example/0/")
+        assert [line for line in err.splitlines() if not line.startswith(said)] == []
         assert out.splitlines() == [str(number) for number in range(11, 3001)]
 
 
