@@ -87,7 +87,10 @@ def compare(first: Floats, second: Floats) -> Comparison:
     if len(first) != len(second):
         raise ValueError(f"trials are compared in pairs; here are {len(first)} and {len(second)}")
     difference = float(second.mean() - first.mean())
-    ratio = float(second.mean() / first.mean()) if first.mean() * second.mean() > 0 else None
+    here, there = float(first.mean()), float(second.mean())
+    ratio: float | None = there / here if here * there > 0 else None
+    if ratio is not None and not math.isfinite(ratio):  # of a mean that is as good as zero
+        ratio = None
     found = Comparison(difference, ratio=ratio)
     if len(first) < 2 or (_constant(first) and _constant(second)):
         return found

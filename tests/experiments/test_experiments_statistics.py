@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -232,6 +232,7 @@ def test_finite_turns_everything_into_plain_json() -> None:
 NUMBER = st.floats(-1e12, 1e12) | st.sampled_from([0.0, 0.1, -37.0])
 
 
+@example([(-2.225073858507e-311, -1.0)])
 @given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=5))
 def test_no_statistic_warns_or_puts_a_number_into_json_that_is_none(pairs: list[tuple[float, float]]) -> None:
     first, second = ([pair[i] for pair in pairs] for i in (0, 1))
