@@ -13,8 +13,6 @@ from gymnasium.envs.registration import registry
 from real_runs import contents, result_of
 
 from adapters.cli.main import main
-from adapters.results import RunFolder
-from mape.errors import ResultsError
 
 CONFIG = """\
 name = "own"
@@ -52,21 +50,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for name in set(sys.modules) - modules:
         if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
             del sys.modules[name]
-
-
-@pytest.fixture
-def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Run a command that stops before its tables are made."""
-
-    def run_until_then(*command: str) -> None:
-        def fail(folder: RunFolder, agent: str) -> None:
-            raise ResultsError("stopped here")
-
-        with monkeypatch.context() as context:
-            context.setattr(RunFolder, "assemble", fail)
-            assert main(list(command)) == 1
-
-    return run_until_then
 
 
 def sha256(text: str) -> str:

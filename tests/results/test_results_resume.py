@@ -56,21 +56,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Run a command that stops before its tables are made."""
-
-    def run_until_then(*command: str) -> None:
-        def fail(folder: RunFolder, agent: str) -> None:
-            raise ResultsError("stopped here")
-
-        with monkeypatch.context() as context:
-            context.setattr(RunFolder, "assemble", fail)
-            assert main(list(command)) == 1
-
-    return run_until_then
-
-
 def hashes(folder: Path) -> tuple[str, str]:
     result = result_of(folder)
     return result["log_sha256"], result["q_table_sha256"]
