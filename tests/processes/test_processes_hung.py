@@ -11,14 +11,14 @@ from types import SimpleNamespace
 
 import pytest
 from bus_peers import Site, join_of
-from real_processes import EXAMPLES, events, up, write_config
+from real_processes import EXAMPLES, events, until, up, write_config
 from roles_on_threads import Roles, paced
 
-from adapters.buses import Wire
+from adapters.buses import Wire, presence
 from adapters.buses.messages import Beat, Joined
 from adapters.buses.wire import ORDERED
 from adapters.processes import supervise
-from adapters.processes.supervise import Failed, Supervisor
+from adapters.processes.supervise import Failed, Supervisor, ask_status
 from adapters.roles import ROLES
 from mape.plan.morphin import Morphin
 
@@ -32,18 +32,36 @@ class Enough(Exception):
     """The test has seen what it wanted."""
 
 
+class Clock:
+    """Time as the supervisor and Knowledge see it: nothing else moves it, however busy the machine is."""
+
+    def __init__(self, monkeypatch):
+        self.now = 1000.0
+        self.missed = 0.0  # by the supervisor alone, which was stopped, as by Ctrl-Z
+        self.stands = False
+        monkeypatch.setattr(
+            supervise, "time", SimpleNamespace(monotonic=lambda: self.now + self.missed, sleep=self.sleep)
+        )
+        monkeypatch.setattr(presence, "time", SimpleNamespace(monotonic=lambda: self.now))
+
+    def sleep(self, seconds):
+        time.sleep(0.002)
+        self.now += 0.0 if self.stands else seconds
+
+
 class Watched:
     """A supervisor of five processes that do nothing, over a Knowledge in this process."""
 
     def __init__(self, folder, monkeypatch, *, hang_after):
-        for name, value in (("LOOK_EVERY", 0.01), ("STATUS_EVERY", 0.02), ("CRASHES", 3)):
+        for name, value in (("STATUS_EVERY", 0.0), ("CRASHES", 3)):
             monkeypatch.setattr(supervise, name, value)
+        self.clock = Clock(monkeypatch)
         self.wire = Wire(f"unixsock-stream/{folder}/k.sock", "example")
         self.told = []
         self.speaking = set(ROLES)
         self.joining = set(ROLES)
         self.path = None
-        self._pids, self._epochs = {}, {}
+        self._pids, self._epochs, self._beats = {}, {}, 0
         # Knowledge is this process, and not the child in its place.
         pid = supervise.Child.pid.fget
         monkeypatch.setattr(
@@ -62,17 +80,26 @@ class Watched:
                     self._speak(role, supervisor.children[role].pid)
                 if enough(self):
                     raise Enough
+                # How long a link takes to come about is not what is looked at here.
+                self.clock.stands = supervisor.status is None
 
             self.supervisor.watch(look)
 
     def _speak(self, role, pid):
+        """Say in the name of a role that it is there, and see it heard."""
         if role in self.joining and self._pids.get(role) != pid:
-            (answer,) = self.raw.get(self.wire.ask(f"join/{role}"), payload=join_of(role, pid=pid), timeout=5)
+            (answer,) = self.raw.get(self.wire.ask(f"join/{role}"), payload=join_of(role, pid=pid), timeout=20)
             self._epochs[role] = Joined.unpack(answer.ok.payload.to_bytes())[0].epoch
             self._pids[role] = pid
         if role in self.speaking:
-            beat = Beat(epoch=self._epochs[role], pid=pid, passes=0, refused=0, waiting=True)
+            self._beats += 1
+            # Its number stands in the one figure of a heartbeat that Knowledge passes on.
+            beat = Beat(epoch=self._epochs[role], pid=pid, passes=0, refused=self._beats, waiting=True)
             self.raw.put(self.wire.beat(role), beat.pack(), **ORDERED)
+            until(lambda: self._heard(role), "a heartbeat", every=0.001)
+
+    def _heard(self, role):
+        return [status.roles[role].refused for status in ask_status(self.raw, self.wire, 20)] == [self._beats]
 
     @property
     def restarts(self):
@@ -132,9 +159,10 @@ def test_roles_that_a_knowledge_started_again_has_not_heard_yet_are_not_hung(her
     def start_knowledge_again(watched):
         children = watched.supervisor.children
         again = children["knowledge"].restarts
-        if watched.speaking and not again and time.monotonic() - children["plan"].started_at > 1.0:
+        if watched.speaking and not again and watched.clock.now - children["plan"].started_at > 1.0:
             watched.speaking.clear()
             os.kill(children["knowledge"].process.pid, signal.SIGKILL)
+            children["knowledge"].process.wait()
             watched.site.close()
             watched.site.open()
             watched.supervisor.status = None
@@ -169,18 +197,10 @@ def test_a_role_that_makes_the_parts_of_many_loops_gives_signs_of_life(here, mon
         run.hash()
 
 
-class Clock:
-    """Time as the supervisor sees it: it jumps where the supervisor was stopped, as by Ctrl-Z."""
-
-    def __init__(self, monkeypatch):
-        self.missed = 0.0
-        there = SimpleNamespace(monotonic=lambda: time.monotonic() + self.missed, sleep=time.sleep)
-        monkeypatch.setattr(supervise, "time", there)
-
-
 def test_a_supervisor_that_was_stopped_takes_nobody_for_hung(here, monkeypatch):
     """What was said while it did not listen, it has not heard; that is nobody's silence."""
-    watched, clock = Watched(here, monkeypatch, hang_after=5.0), Clock(monkeypatch)
+    watched = Watched(here, monkeypatch, hang_after=5.0)
+    clock = watched.clock
     passed = []
 
     def stop_and_go_on(watched):
@@ -196,7 +216,8 @@ def test_a_supervisor_that_was_stopped_takes_nobody_for_hung(here, monkeypatch):
 
 def test_who_does_not_answer_a_supervisor_right_after_its_stop_has_its_time_all_the_same(here, monkeypatch):
     """The link that it had is gone, and the next one takes a moment."""
-    watched, clock = Watched(here, monkeypatch, hang_after=5.0), Clock(monkeypatch)
+    watched = Watched(here, monkeypatch, hang_after=5.0)
+    clock = watched.clock
     ask, unanswered = supervise.ask_status, []
 
     def ask_status(*asked):
@@ -218,7 +239,8 @@ def test_who_does_not_answer_a_supervisor_right_after_its_stop_has_its_time_all_
 
 
 def test_who_joins_while_the_supervisor_is_stopped_is_not_taken_for_one_that_never_joined(here, monkeypatch):
-    watched, clock = Watched(here, monkeypatch, hang_after=5.0), Clock(monkeypatch)
+    watched = Watched(here, monkeypatch, hang_after=5.0)
+    clock = watched.clock
     watched.joining.remove("plan")
     watched.speaking.remove("plan")
     passed = []

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import time
 
@@ -195,11 +196,13 @@ def test_a_handler_that_hangs_is_killed_and_done_again(own, monkeypatch):
     config = gridworld(own, 150)
     options = ("--set", "plan.name=own_parts:Hangs")
     monkeypatch.setenv("MAY_HANG", "yes")
-    with up(config, *options, "--hang-after", "1") as running:
+    with up(config, *options, "--hang-after", "3") as running:
         result = running.result()
         said = running.process.said
     assert (own / "hung").exists()
-    assert "restarts: plan 1" in said
+    # On a machine that stood still for a moment, others may have been taken for hung beside it.
+    assert re.search(r"^plan \(process \d+\) was silent for", said.replace("mapek: ", ""), re.MULTILINE)
+    assert re.search(r"^restarts: .*\bplan [1-9]", said, re.MULTILINE)
     monkeypatch.delenv("MAY_HANG")
     assert hashes(result) == hashes(run_here(config, *options))
 
