@@ -1,7 +1,9 @@
 """Where processes meet: nobody joins a stranger's run, and who leaves before the run is over is started again."""
 
 import json
+import os
 import re
+import signal
 import socket
 import sys
 
@@ -88,8 +90,10 @@ def test_a_second_run_at_the_same_place_is_refused_at_once_and_the_first_is_unha
     with up(config, at=at) as running:
         running.wait_for_pass(20)
         before = running.children()
+        os.kill(before["execute"], signal.SIGSTOP)  # so that it is not over before the second has begun
         with up(config, out="second", at=at) as second:
-            said = second.process.end(1, 20.0)
+            said = second.process.end(1)
+        os.kill(before["execute"], signal.SIGCONT)
         assert f"cannot listen on {at}; is another Knowledge running there?" in said
         assert not second.out.exists()
         assert running.children() == before
