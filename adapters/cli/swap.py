@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import time
 import tomllib
 from typing import Any
 
+import zenoh
+
 from adapters.buses.messages import Control, Replaced
+from adapters.buses.wire import Wire
 from adapters.cli.common import operator
 from adapters.processes.replacing import CHECKED_WITHIN
+from adapters.processes.supervise import ask_status
 from mape.errors import BusError, ConfigError, MapekError
 from mape.parts import owner
 from mape.tables import refuse_infinity
@@ -16,12 +21,19 @@ from mape.tables import refuse_infinity
 ANSWERED_WITHIN = CHECKED_WITHIN + 15.0
 """Seconds that a role has to check the part and to reach the end of its pass."""
 
+THERE_WITHIN = 5.0
+"""Seconds that a role has to be there: it may just be started again, or its link be about to come back."""
+
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
     role = owner(chosen.part)
     control = Control(what="swap", part=chosen.part, to=_spec(chosen.to)).pack()
     with operator(chosen) as (session, wire):
+        # A question that nobody hears ends at once, and one that was heard must not be asked twice.
+        deadline = time.monotonic() + THERE_WITHIN
+        while not _is_there(role, session, wire) and time.monotonic() < deadline:
+            time.sleep(0.05)
         said = None
         for reply in session.get(wire.control(role), payload=control, timeout=ANSWERED_WITHIN):
             if reply.ok is not None:
@@ -34,6 +46,10 @@ def execute(chosen: argparse.Namespace) -> int:
             "does the loop run?"
         )
     raise MapekError(said)
+
+
+def _is_there(role: str, session: zenoh.Session, wire: Wire) -> bool:
+    return any(status.roles[role].alive for status in ask_status(session, wire, 1.0))
 
 
 def _spec(text: str) -> dict[str, Any]:

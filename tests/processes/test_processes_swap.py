@@ -6,7 +6,19 @@ import re
 import signal
 
 import pytest
-from real_processes import EXAMPLES, events, hashes, records, run_here, store, swap, up, write_config
+from real_processes import (
+    EXAMPLES,
+    events,
+    hashes,
+    looking_on,
+    records,
+    run_here,
+    store,
+    swap,
+    until,
+    up,
+    write_config,
+)
 
 from knowledge import ChangePlan, from_json
 from mape import load
@@ -139,6 +151,19 @@ def test_a_swap_is_what_the_config_would_have_said(config):
     told = run_here(with_swaps(config, made))
     assert hashes(result) == hashes(told)
     assert result["trials"][0]["alarms"] == told["trials"][0]["alarms"]
+
+
+def test_a_swap_reaches_a_role_that_is_just_being_started_again(config):
+    with up(config) as running:
+        running.wait_for_pass(60)
+        with looking_on(running.endpoint) as ask:
+            os.kill(running.child("plan"), signal.SIGKILL)
+            until(lambda: (status := ask()) and not status.roles["plan"].alive, "its absence")
+        code, said = swap(running, "plan", "own_parts:Gentle")
+        assert code == 0, said
+        let_go(config)
+        running.result()
+    assert [event.pass_no for event in events(running.log, "swapped")] == [pass_named(said)]
 
 
 def test_what_does_not_serve_is_refused_and_the_old_part_goes_on(config):
