@@ -20,3 +20,40 @@ def here() -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="mp-"))
     yield folder
     shutil.rmtree(folder, ignore_errors=True)
+
+
+WALKS = """
+import os
+import time
+
+from mape.analyze.changes import Changes
+
+
+class Walks(Changes):
+    def analyze(self, symptom):
+        if os.path.exists(os.environ.get("WALK", "")):
+            time.sleep(0.02)
+        return super().analyze(symptom)
+"""
+
+
+class Walk:
+    """An analyzer with which a run in processes goes at a walk: it is not over before what is to meet it."""
+
+    part = "walks:Walks"
+
+    def __init__(self, folder: Path) -> None:
+        (folder / "walks.py").write_text(WALKS)
+        self.path = folder / "walk"
+        self.path.touch()
+
+    def over(self) -> None:
+        """Let the run go on at its own pace, and others after it."""
+        self.path.unlink()
+
+
+@pytest.fixture
+def walk(here: Path, monkeypatch: pytest.MonkeyPatch) -> Walk:
+    found = Walk(here)
+    monkeypatch.setenv("WALK", str(found.path))
+    return found

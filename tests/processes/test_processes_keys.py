@@ -65,8 +65,8 @@ def test_five_machines_with_keys_run_what_one_process_runs(here, address):
     assert hashes(json.loads((here / "served" / "result.json").read_bytes())) == alone(config)
 
 
-def test_up_with_keys_outlives_a_swap_and_needs_the_operators_key(here, address):
-    config = load(EXAMPLES / "frozen_lake.toml", overrides=["episodes=600"])
+def test_up_with_keys_outlives_a_swap_and_needs_the_operators_key(here, address, walk):
+    config = load(EXAMPLES / "frozen_lake.toml", overrides=["episodes=600", f"analyze={walk.part}"])
     config = write_config(here, json.loads(config.to_json()))
     say("keys", str(here / "keys"))
     with up(config, "--tls", str(here / "keys"), at=address) as running:
@@ -74,4 +74,5 @@ def test_up_with_keys_outlives_a_swap_and_needs_the_operators_key(here, address)
         assert swap(running, "plan.schedule", "success", "--tls", str(here / "keys"))[0] == 0
         code, said = swap(running, "plan.schedule", "success")
         assert (code, said.startswith("mapek: no Knowledge answers")) == (1, True)
+        walk.over()
         running.result()

@@ -220,13 +220,14 @@ def test_a_handler_that_hangs_is_killed_and_done_again(own, monkeypatch):
     assert hashes(result) == hashes(run_here(config, *options))
 
 
-def test_a_planner_that_reads_knowledge_sees_the_same_in_five_processes(own):
+def test_a_planner_that_reads_knowledge_sees_the_same_in_five_processes(own, walk):
     config = gridworld(own, 200)
-    options = ("--set", "plan.name=own_parts:Reads")
+    options = ("--set", "plan.name=own_parts:Reads", "--set", f"analyze.name={walk.part}")
     with up(config, *options, "--snapshot-every", "30") as running:
         for role, moment in (("plan", 35), ("execute", 65), ("plan", 100), ("execute", 155)):
             running.wait_for_pass(moment)
             os.kill(running.child(role), signal.SIGKILL)
+        walk.over()
         result = running.result()
     assert hashes(result) == hashes(run_here(config, *options))
     assert records(running.log) == {0: 4 * 200 + 1}

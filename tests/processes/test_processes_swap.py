@@ -26,20 +26,7 @@ from mape import load
 EPISODES = 400
 
 OWN = '''
-import os
-import time
-
-from mape.analyze.changes import Changes
 from mape.plan.morphin import Morphin
-
-
-class Paced(Changes):
-    """Changes, at a walk until the file that HOLD names is gone: the run is not over before its swaps."""
-
-    def analyze(self, symptom):
-        if os.path.exists(os.environ.get("HOLD", "")):
-            time.sleep(0.02)
-        return super().analyze(symptom)
 
 
 class SecondFails(Morphin):
@@ -83,19 +70,12 @@ class OneRate(Gentle):
 
 
 @pytest.fixture
-def config(here, monkeypatch):
+def config(here, walk):
     table = json.loads(load(EXAMPLES / "gridworld_goals.toml").to_json())
     table["system"]["options"]["switch_at"] = [51, 301]
-    table |= {"episodes": EPISODES, "analyze": "own_parts:Paced"}
+    table |= {"episodes": EPISODES, "analyze": walk.part}
     (here / "own_parts.py").write_text(OWN)
-    hold = here / "hold"
-    hold.touch()
-    monkeypatch.setenv("HOLD", str(hold))
     return write_config(here, table)
-
-
-def let_go(config):
-    (config.parent / "hold").unlink()
 
 
 def pass_named(said):
@@ -119,7 +99,7 @@ def plan_of(log, number):
     return record
 
 
-def test_a_swap_is_what_the_config_would_have_said(config):
+def test_a_swap_is_what_the_config_would_have_said(config, walk):
     swaps = [
         ("plan", "own_parts:Gentle", {"name": "own_parts:Gentle"}),
         ("monitor", '{name="two_window", reference=20, recent=5, threshold=30.0}',
@@ -140,7 +120,7 @@ def test_a_swap_is_what_the_config_would_have_said(config):
             number = pass_named(said)
             assert before < number <= running.passes() + 2
             made.append((number, part, spec))
-        let_go(config)
+        walk.over()
         result = running.result()
     assert [event.pass_no for event in events(running.log, "swapped")] == [number for number, _, _ in made]
     first, _, other, _ = (number for number, _, _ in made)
@@ -153,7 +133,7 @@ def test_a_swap_is_what_the_config_would_have_said(config):
     assert result["trials"][0]["alarms"] == told["trials"][0]["alarms"]
 
 
-def test_a_swap_reaches_a_role_that_is_just_being_started_again(config):
+def test_a_swap_reaches_a_role_that_is_just_being_started_again(config, walk):
     with up(config) as running:
         running.wait_for_pass(60)
         with looking_on(running.endpoint) as ask:
@@ -161,12 +141,12 @@ def test_a_swap_reaches_a_role_that_is_just_being_started_again(config):
             until(lambda: (status := ask()) and not status.roles["plan"].alive, "its absence")
         code, said = swap(running, "plan", "own_parts:Gentle")
         assert code == 0, said
-        let_go(config)
+        walk.over()
         running.result()
     assert [event.pass_no for event in events(running.log, "swapped")] == [pass_named(said)]
 
 
-def test_what_does_not_serve_is_refused_and_the_old_part_goes_on(config):
+def test_what_does_not_serve_is_refused_and_the_old_part_goes_on(config, walk):
     faulty = {
         ("plan", "own_parts:Late"): "no budget left",
         ("plan", "own_parts:Broken"): "epsilon",
@@ -187,7 +167,7 @@ def test_what_does_not_serve_is_refused_and_the_old_part_goes_on(config):
         for part, to in faulty:
             said[part, to] = swap(running, part, to)
         assert not running.process.ended
-        let_go(config)
+        walk.over()
         result = running.result()
     for asked, (code, sentence) in said.items():
         assert code in (1, 2), (asked, sentence)
@@ -197,12 +177,12 @@ def test_what_does_not_serve_is_refused_and_the_old_part_goes_on(config):
     assert records(running.log) == {0: 4 * EPISODES + 1}
 
 
-def test_a_part_that_fails_in_one_of_two_loops_is_told_so(config):
+def test_a_part_that_fails_in_one_of_two_loops_is_told_so(config, walk):
     with up(config, "--set", "loops=2", "--set", "episodes=300") as running:
         running.wait_for_pass(30)
         code, said = swap(running, "plan", "own_parts:SecondFails")
         taken = events(running.log, "swapped")
-        let_go(config)
+        walk.over()
         running.result()
     assert (code, "no budget for a second loop" in said) == (1, True)
     if taken:  # the first loop may have come first
