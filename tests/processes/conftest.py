@@ -56,4 +56,5 @@ class Walk:
 def walk(here: Path, monkeypatch: pytest.MonkeyPatch) -> Walk:
     found = Walk(here)
     monkeypatch.setenv("WALK", str(found.path))
+    monkeypatch.syspath_prepend(here)
     return found

@@ -14,6 +14,9 @@ from mape import load
 
 AT_ONCE = 5.0
 """Seconds; an end that was heard takes a fraction of one, but a machine may be busy."""
+
+PROMISED = 2.0
+WITHIN = pytest.mark.parametrize("within", [AT_ONCE, pytest.param(PROMISED, marks=pytest.mark.long)])
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 SIGNALS = pytest.mark.parametrize("number", CODES)
 
@@ -27,8 +30,8 @@ def gridworld(here, episodes, *overrides):
 
 
 @SIGNALS
-def test_up_ends_at_once_with_all_its_children_and_is_gone_on_with(here, number, walk, monkeypatch):
-    monkeypatch.syspath_prepend(here)
+@WITHIN
+def test_up_ends_at_once_with_all_its_children_and_is_gone_on_with(here, number, within, walk):
     config = gridworld(here, 400, f"analyze={walk.part}")
     with up(config) as running:
         running.wait_for_pass(50)
@@ -36,7 +39,7 @@ def test_up_ends_at_once_with_all_its_children_and_is_gone_on_with(here, number,
         assert set(children) == set(ROLES)
         code, took = running.process.signalled(number)
         wait_until_gone(set(children.values()))
-        assert (code, took < AT_ONCE) == (CODES[number], True), f"exit code {code} after {took:.2f} s"
+        assert (code, took < within) == (CODES[number], True), f"exit code {code} after {took:.2f} s"
         assert "mapek resume up" in running.process.said.replace(f"{here}/", "")
         assert 50 <= running.passes() < 400
     walk.over()
@@ -70,7 +73,8 @@ def test_a_signal_while_the_figures_are_drawn_is_heard_too(here):
     assert "mapek resume" in running.process.said
 
 
-def test_every_served_role_ends_at_once(here):
+@WITHIN
+def test_every_served_role_ends_at_once(here, within):
     config = gridworld(here, 100_000)
     ended = {}
     with ExitStack() as opened:
@@ -87,7 +91,7 @@ def test_every_served_role_ends_at_once(here):
         (number.name, role): code for number, code in CODES.items() for role in ROLES
     }
     print({key: round(took, 2) for key, (_, took) in ended.items()})
-    slow = {key: round(took, 2) for key, (_, took) in ended.items() if took >= AT_ONCE}
+    slow = {key: round(took, 2) for key, (_, took) in ended.items() if took >= within}
     assert slow == {}
 
 
