@@ -43,22 +43,33 @@ def terminated_by_signal() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise Terminated
 
-    def raise_again(lost: Any) -> None:
-        # Python was just in a finaliser, out of which no exception comes: a moment later it is elsewhere.
-        if lost.exc_type not in signals:
-            hook(lost)
-            return
-        if lost.exc_type is Terminated:
+    def raise_again(lost: type[BaseException]) -> None:
+        # Python was where no exception comes out of; a moment later it is elsewhere.
+        if lost is Terminated:
             signal.signal(signal.SIGTERM, raise_it)
-        threading.Timer(0.01, os.kill, (os.getpid(), signals[lost.exc_type])).start()
+        threading.Timer(0.01, os.kill, (os.getpid(), signals[lost])).start()
 
-    hook, sys.unraisablehook = sys.unraisablehook, raise_again
+    def lost_in_a_finaliser(lost: Any) -> None:
+        raise_again(lost.exc_type) if lost.exc_type in signals else hook(lost)
+
+    def not_of_a_signal(record: logging.LogRecord) -> bool:
+        # Of what a callback raises, Zenoh makes a line of its log; those of a session run in this thread too.
+        lost = record.exc_info[0] if record.exc_info else None
+        if lost is None or lost not in signals:
+            return True
+        raise_again(lost)
+        return False
+
+    callbacks = logging.getLogger("zenoh.handlers")
+    callbacks.addFilter(not_of_a_signal)
+    hook, sys.unraisablehook = sys.unraisablehook, lost_in_a_finaliser
     before = signal.signal(signal.SIGTERM, raise_it)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
         sys.unraisablehook = hook
+        callbacks.removeFilter(not_of_a_signal)
 
 
 def leash() -> threading.Event:

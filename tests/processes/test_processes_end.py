@@ -132,3 +132,40 @@ def test_a_signal_that_meets_a_finaliser_is_not_lost(here):
     """What is raised within one comes out nowhere, and figures or tables leave many behind."""
     ended = run("-c", IN_A_FINALISER, cwd=here, start=(sys.executable,))
     assert (ended.stdout.split(), ended.stderr) == (["Terminated", "KeyboardInterrupt"], "")
+
+
+IN_A_CALLBACK = """
+import os, signal, threading
+import zenoh
+from adapters.buses import Wire
+from adapters.processes.serve import Terminated, terminated_by_signal
+
+
+def heard(number):
+    calls = []
+
+    def hear(sample):
+        calls.append(sample)
+        os.kill(os.getpid(), number)
+        threading.Event().wait(0.0)
+
+    try:
+        # What a session says to itself is heard by the thread that says it.
+        with terminated_by_signal(), Wire(f"unixsock-stream/{os.getcwd()}/k.sock", "example").listen() as session:
+            session.declare_subscriber("mape/example/said", zenoh.handlers.Callback(hear, indirect=False))
+            session.put("mape/example/said", b"")
+            assert len(calls) == 1
+            threading.Event().wait(10.0)
+    except (Terminated, KeyboardInterrupt) as stop:
+        return type(stop).__name__
+
+
+for number in (signal.SIGTERM, signal.SIGINT):
+    print(heard(number))
+"""
+
+
+def test_a_signal_that_meets_a_callback_of_zenoh_is_not_lost(here):
+    """Zenoh logs what is raised within one, and lets it come out nowhere."""
+    ended = run("-c", IN_A_CALLBACK, cwd=here, start=(sys.executable,))
+    assert (ended.stdout.split(), ended.stderr) == (["Terminated", "KeyboardInterrupt"], "")
