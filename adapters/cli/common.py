@@ -73,7 +73,7 @@ def open_folder(
         if getattr(chosen, "verbose", False):
             print(f"{agent}: {checked}{_looked_at(chosen, trace)}", file=sys.stderr)
     path = Path(chosen.out) if chosen.out else default_path(name)
-    folder = RunFolder(path, kind, configs, trace, chosen.arguments)
+    folder = RunFolder(path, kind, configs, trace, chosen.arguments, mended=getattr(chosen, "mended", False))
     if folder.resumed:
         say(chosen, f"continuing in {folder.path}: {folder.resumed:,} trials are finished already")
     return folder

@@ -170,6 +170,10 @@ def parser() -> argparse.ArgumentParser:
         description="Continue an unfinished run by the command that began it, in the folder where it was given.",
     )
     resume.add_argument("folder", metavar="DIR", help="folder of the run")
+    resume.add_argument(
+        "--mended", action="store_true",
+        help="go on although modules of your own have changed since; what is finished stays as it is",
+    )  # fmt: skip
     _how(resume)
 
     keys = commands.add_parser(

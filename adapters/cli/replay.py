@@ -16,7 +16,8 @@ from adapters.cli.sentences import ids, sentence
 from adapters.replay.records import Difference, LogReplay, Moment, Replayed, as_json, log_of
 from adapters.replay.tables import replay_tables
 from adapters.results.files import read_json
-from adapters.results.folder import read_manifest, versions
+from adapters.results.folder import MENDED, MODULES, read_manifest, versions
+from adapters.results.own_code import other_versions
 from adapters.stores import Store
 from mape.errors import ConfigError
 from mape.trials import combined_hash
@@ -108,7 +109,7 @@ def _print_json(
             "log_sha256": _combined(found, "log_sha256"),
             "q_table_sha256": _combined(found, "q_table_sha256"),
             "result": "equal" if compared and difference is None else "different" if compared else "not compared",
-            "versions": _other_versions(log.versions),
+            **_other_code(log.versions, _manifest(path.parent)),
         }
     )
 
@@ -130,7 +131,7 @@ def _print(
         print(f"Observations cannot be derived again ({why}); the other records are derived from those in the log")
     if difference is not None:
         print(f"{records:,} records are equal; the first difference: {_told(difference)}")
-        _print_versions(log.versions)
+        _print_other_code(log.versions, _manifest(path.parent))
         return
     print(f"{records:,} records derived again: no difference")
     if chosen.to is not None:
@@ -215,7 +216,7 @@ def _tables(chosen: argparse.Namespace, folder: Path) -> int:
     if chosen.json:
         fields = found._asdict()
         _dump({"folder": str(folder), "equal": found.difference is None, **fields,
-               "versions": _other_versions(manifest.get("versions", {}))})  # fmt: skip
+               **_other_code(manifest.get("versions", {}), manifest)})  # fmt: skip
     else:
         print(f"{folder}: {manifest['kind']}, tables without records")
         trials = f"{found.trials:,} trial{'s' * (found.trials > 1)}"
@@ -227,20 +228,39 @@ def _tables(chosen: argparse.Namespace, folder: Path) -> int:
             print("result.json says the same")
         else:
             print(f"the first difference: {found.difference}")
-            _print_versions(manifest.get("versions", {}))
+            _print_other_code(manifest.get("versions", {}), manifest)
     return 0 if found.difference is None else 1
 
 
-def _other_versions(then: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return name -> versions then and now, where they are not the same."""
+# What made it, and what derives it again.
+
+
+def _manifest(folder: Path) -> Mapping[str, Any]:
+    """Return the manifest beside a log; a log alone has none."""
+    return read_manifest(folder) if (folder / "manifest.json").exists() else {}
+
+
+def _other_code(then: Mapping[str, str], manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return versions, and hashes of modules of the user's own, then and now, where they are not the same."""
     now = versions()
-    return {name: [then[name], now[name]] for name in now if name in then and then[name] != now[name]}
+    return {
+        "versions": {name: [then[name], now[name]] for name in now if name in then and then[name] != now[name]},
+        "modules": {other.module: [other.then, other.now] for other in other_versions(manifest.get(MODULES) or {})},
+        "mended": manifest.get(MENDED, []),
+    }
 
 
-def _print_versions(then: Mapping[str, str]) -> None:
-    if others := _other_versions(then):
+def _print_other_code(then: Mapping[str, str], manifest: Mapping[str, Any]) -> None:
+    if others := _other_code(then, manifest)["versions"]:
         told = ", ".join(f"{name} {was} then, {is_now} now" for name, (was, is_now) in others.items())
         print(f"bits are equal for equal versions only: {told}")
+    for other in other_versions(manifest.get(MODULES) or {}):
+        print(f"this is {other}")
+    for one in manifest.get(MENDED, []):
+        module, sha256 = one["module"], one["sha256"][:12]
+        print(
+            f"module {module!r} was changed in the middle of the run: what was finished before is of SHA-256 {sha256}"
+        )
 
 
 def _dump(fields: Mapping[str, Any]) -> None:

@@ -30,6 +30,7 @@ def execute(chosen: argparse.Namespace) -> int:
     again = _parsed(command, folder)
     again.out = str(folder)
     again.quiet = again.quiet or chosen.quiet
+    again.mended = chosen.mended
     if chosen.workers is not None:
         if not hasattr(again, "workers"):
             raise ConfigError(f"`mapek {again.command}` has no --workers: each role is a process of its own")

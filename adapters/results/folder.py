@@ -35,7 +35,7 @@ import numpy.typing as npt
 
 from adapters.results.chunk import read_arrays, read_chunk, remove_parts
 from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
-from adapters.results.own_code import other_version, own_modules
+from adapters.results.own_code import other_versions, own_modules
 from adapters.results.table import read_episodes, read_last, write_npz
 from mape import __version__
 from mape.config import Config
@@ -51,6 +51,9 @@ BEGUN_BY = ("command", "cwd")
 
 MODULES = "modules"
 """Entry of a manifest for the user's own code, see `own_modules`; older ones have none."""
+
+MENDED = "mended"
+"""Entry for what modules of the user's own were when the run was begun, or gone on with, and are no more."""
 
 
 def versions() -> dict[str, str]:
@@ -153,6 +156,8 @@ class RunFolder:
         Episodes of trial 0 whose steps are kept; a run that is continued has the same.
     command
         Arguments of the command line, with which `mapek resume` goes on; what is None is not known.
+    mended
+        Go on although modules of the user's own have changed since; the manifest then says so.
 
     Raises
     ------
@@ -167,6 +172,8 @@ class RunFolder:
         configs: Mapping[str, Config],
         trace: tuple[int, int] | None = None,
         command: Sequence[str] | None = None,
+        *,
+        mended: bool = False,
     ) -> None:
         self.path = path
         self.configs = dict(configs)
@@ -193,7 +200,7 @@ class RunFolder:
             self._lock.close()
             raise ResultsError(f"another run is writing to {path}; wait for it, or choose another --out") from None
         try:
-            self._open(wanted)
+            self._open(wanted, mended)
         except BaseException:
             self.close()
             raise
@@ -209,7 +216,7 @@ class RunFolder:
                 f"{self.path} is not empty ({sorted(others)[0]}) and holds no run of ours; choose another --out"
             )
 
-    def _open(self, wanted: dict[str, Any]) -> None:
+    def _open(self, wanted: dict[str, Any], mended: bool) -> None:
         manifest = self.path / "manifest.json"
         if not manifest.exists():
             self._refuse_foreign()
@@ -221,7 +228,7 @@ class RunFolder:
         if (self.path / "result.json").exists():
             raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
         there = read_manifest(self.path, "choose another --out")
-        runs = {name: value for name, value in there.items() if name not in (*BEGUN_BY, MODULES)}
+        runs = {name: value for name, value in there.items() if name not in (*BEGUN_BY, MODULES, MENDED)}
         if runs != wanted:
             what, had, has = first_difference(runs, wanted)
             way_out = "give the same command to continue it"
@@ -231,15 +238,20 @@ class RunFolder:
                 f"{self.path} holds an unfinished run with {what} = {had!r}, not {has!r}; {way_out}, or choose another "
                 "--out"
             )
-        if (said := other_version(there.get(MODULES) or {})) is not None:
+        others = other_versions(there.get(MODULES) or {})
+        if others and not mended:
             raise ResultsError(
-                f"{self.path} holds an unfinished run that was begun with {said}. Its results would belong to neither. "
-                "Put the file back as it was to continue, or choose another --out; or, where what is finished would "
-                f"come out the same, take the module out of {manifest}"
+                f"{self.path} holds an unfinished run that was begun with {others[0]}. Its results would belong to "
+                "neither. Put the file back as it was to continue, or choose another --out; or, where what is finished "
+                f"is to stay as it is, `mapek resume {self.path} --mended`"
             )
         remove_parts(self.path)
         self._write_configs(wanted)
         self.resumed = sum(len(self.finished(agent)) for agent in self.configs)
+        if others:
+            then = [{"module": other.module, "sha256": other.then} for other in others]
+            own = own_modules(self.configs.values())
+            write_json(manifest, {**there, MODULES: own, MENDED: [*there.get(MENDED, []), *then]})
 
     def _write_configs(self, wanted: Mapping[str, Any]) -> None:
         for agent in self.configs:

@@ -8,6 +8,7 @@ import site
 import sysconfig
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 
@@ -31,15 +32,24 @@ def own_modules(configs: Iterable[Config]) -> dict[str, str]:
     return found
 
 
-def other_version(begun_with: Mapping[str, str]) -> str | None:
-    """Say which of these modules is not the one that it was, or None where all are; see `own_modules`."""
-    for name, then in begun_with.items():
-        file = _source_of(name)
-        now = None if file is None else _sha256_of(file)
-        if now != then:
-            hashes = f"SHA-256 {then[:12]} then, {now[:12] if now else 'none'} now"
-            return f"another version of module {name!r} ({file or 'nowhere now'}): {hashes}"
-    return None
+class OtherVersion(NamedTuple):
+    """A module that is not the one that it was: its SHA-256 then and now, None where it is nowhere any more."""
+
+    module: str
+    file: Path | None
+    then: str
+    now: str | None
+
+    def __str__(self) -> str:
+        hashes = f"SHA-256 {self.then[:12]} then, {self.now[:12] if self.now else 'none'} now"
+        return f"another version of module {self.module!r} ({self.file or 'nowhere now'}): {hashes}"
+
+
+def other_versions(begun_with: Mapping[str, str]) -> list[OtherVersion]:
+    """Return which of these modules, with their hashes, are not the ones that they were; see `own_modules`."""
+    files = {name: _source_of(name) for name in begun_with}
+    now = {name: None if file is None else _sha256_of(file) for name, file in files.items()}
+    return [OtherVersion(name, files[name], then, now[name]) for name, then in begun_with.items() if now[name] != then]
 
 
 def _source_of(module: str) -> Path | None:
