@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -18,6 +19,7 @@ from adapters.buses.hub import KnowledgeHub
 from adapters.buses.member import Member
 from adapters.buses.messages import Layout
 from adapters.buses.wire import Wire, versions
+from adapters.processes.supervise import ENDS_WITHIN
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
 from mape.config import Config
@@ -88,6 +90,9 @@ def leash() -> threading.Event:
             while os.read(0, 4096):
                 released.set()
         os.kill(os.getpid(), signal.SIGTERM)
+        # A part may keep to itself what ends it. Nobody else would say the last word now.
+        time.sleep(ENDS_WITHIN)
+        os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=watch, name="leash", daemon=True).start()
     return released

@@ -63,6 +63,31 @@ def test_children_end_by_themselves_when_up_is_killed(here):
     assert "Traceback" not in "".join(running.said_by(role) for role in ROLES)
 
 
+KEEPS_ON = """
+from mape.analyze.changes import Changes
+
+
+class KeepsOn(Changes):
+    def analyze(self, symptom):
+        while symptom.pass_no == 20:
+            try:
+                open("keeps-on", "w").close()
+            except BaseException:
+                pass
+        return super().analyze(symptom)
+"""
+
+
+def test_a_part_that_lets_nothing_end_it_ends_all_the_same_when_up_is_killed(here, monkeypatch):
+    monkeypatch.syspath_prepend(here)
+    (here / "own_keeps_on.py").write_text(KEEPS_ON)
+    with up(gridworld(here, 100, "analyze=own_keeps_on:KeepsOn")) as running:
+        until((here / "keeps-on").exists, "a part that keeps on")
+        children = set(running.children().values())
+        running.process.signalled(signal.SIGKILL)
+        wait_until_gone(children)
+
+
 def test_a_signal_while_the_figures_are_drawn_is_heard_too(here):
     config = gridworld(here, 60)
     with up(config, short=("-q",)) as running:
