@@ -76,7 +76,7 @@ def test_execute_restarts_across_a_gap_of_dropped_episodes_that_have_no_plans(he
 
 
 def test_a_restarted_execute_puts_the_plans_in_force_that_came_while_it_was_behind_with_them(here, adopted):
-    with Roles(free(400), here, snapshot_every=20) as run:
+    with Roles(free(1000), here, snapshot_every=20) as run:
         Paced.free.set()
         run.start_all()
         run.wait_for_pass(40)
@@ -94,11 +94,11 @@ def test_a_restarted_execute_puts_the_plans_in_force_that_came_while_it_was_behi
         for role in OTHERS:
             run.start(role)
         run.join()
-        assert run.last == (400,) * 4
+        assert run.last == (1000,) * 4
     assert adopted[0] < kept - 50, "the state was not far ahead of its plan"
-    assert adopted == [*range(adopted[0], 401)]
+    assert adopted == [*range(adopted[0], 1001)]
     seen = observations(run.path)
-    assert [one.pass_no for one in seen] == [*range(1, 401)]
+    assert [one.pass_no for one in seen] == [*range(1, 1001)]
     assert refused(run.path) == []
 
 

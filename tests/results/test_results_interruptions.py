@@ -1,6 +1,7 @@
 """A run that is killed, interrupted or crowded out leaves what is finished, and goes on from there."""
 
 import contextlib
+import hashlib
 import json
 import os
 import signal
@@ -244,7 +245,9 @@ def test_a_reader_of_a_run_that_leaves_early_is_told_how_to_go_on(tmp_path: Path
     assert leftovers(tmp_path) == []
 
 
-def test_a_run_that_fails_under_way_is_continued_with_the_mended_part_once_the_user_says_so(tmp_path: Path) -> None:
+def test_a_run_that_a_fault_of_a_part_has_stopped_goes_on_with_the_mended_part_once_the_user_says_so(
+    tmp_path: Path,
+) -> None:
     part = tmp_path / "flaky.py"
     text = (
         "from mape.monitor.page_hinkley import PageHinkley\n\n"
@@ -255,24 +258,28 @@ def test_a_run_that_fails_under_way_is_continued_with_the_mended_part_once_the_u
         "        assert Flaky.seen < {limit}, 'worn out'\n"
         "        return super().update(x)\n"
     )
-    part.write_text(text.format(limit=1000))
+    part.write_text(faulty := text.format(limit=1000))
     command = (
         *MANY, "--trials", "4", "--workers", "1", "--set", 'monitor.detectors=["flaky:Flaky"]', "--out", "out",
     )  # fmt: skip
 
     failed = run(*command, cwd=tmp_path, code=1)
     assert "mapek: trial 2: detector Flaky raised AssertionError: worn out, at pass 200 on return = " in failed.stderr
-    assert len(finished_chunks(tmp_path / "out")) == 2
+    assert len(kept := finished_chunks(tmp_path / "out")) == 2
     assert leftovers(tmp_path / "out") == []
 
     part.write_text(text.format(limit=10**9))
     refused = run(*command, cwd=tmp_path, code=1).stderr
     assert "another version of module 'flaky'" in refused
-    assert refused.endswith("take the module out of out/manifest.json\n")
+    assert refused.endswith("`mapek resume out --mended`\n")
+    assert finished_chunks(tmp_path / "out") == kept
+    again = run("resume", "out", "--mended", cwd=tmp_path)
+    assert f"continuing in {tmp_path / 'out'}: 2 trials are finished already" in again.stdout
     manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
-    del manifest["modules"]["flaky"]
-    (tmp_path / "out" / "manifest.json").write_text(json.dumps(manifest))
-    assert "continuing in out: 2 trials are finished already" in run(*command, cwd=tmp_path).stdout
+    assert manifest["modules"] == {"flaky": hashlib.sha256(part.read_bytes()).hexdigest()}
+    assert manifest["mended"] == [{"module": "flaky", "sha256": hashlib.sha256(faulty.encode()).hexdigest()}]
+    run(*command[:-1], "undisturbed", cwd=tmp_path)
+    assert result_of(tmp_path / "out") == result_of(tmp_path / "undisturbed")
 
 
 def test_a_trial_that_fails_leaves_the_trials_before_it_and_its_own_passes(tmp_path, monkeypatch):

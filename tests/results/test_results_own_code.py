@@ -31,15 +31,6 @@ from mape.monitor.page_hinkley import PageHinkley
 class Mine(PageHinkley):
     pass
 """
-FAULT = """
-    seen = []
-
-    def update(self, x):
-        self.seen.append(x)
-        if len(self.seen) > 22:
-            raise ValueError("too much")
-        return super().update(x)
-"""
 JUMPY = """
     def update(self, x):
         super().update(x)
@@ -97,32 +88,6 @@ def test_a_run_whose_part_was_edited_meanwhile_is_not_gone_on_with_until_it_is_p
     (here / "own_detector.py").write_text(DETECTOR)
     assert main(list(again)) == 0
     assert result_of(here / "out") == result_of(here / "undisturbed")
-
-
-def test_a_run_that_a_fault_of_a_part_has_stopped_goes_on_once_the_part_is_mended(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trials = ("--trials", "6")
-    assert main([*RUN, *trials, "--out", "undisturbed"]) == 0
-    faulty = DETECTOR.replace("pass", FAULT)
-    (here / "own_detector.py").write_text(faulty)
-    del sys.modules["own_detector"]
-    assert main([*RUN, *trials, "--out", "out"]) == 1
-    assert "too much" in capsys.readouterr().err
-    (here / "own_detector.py").write_text(DETECTOR)
-    del sys.modules["own_detector"]
-    before = contents(here / "out")
-    assert main(["resume", "out"]) == 1
-    assert "`mapek resume out --mended`" in capsys.readouterr().err.replace(f"{here}/", "")
-    assert contents(here / "out") == before
-    assert any(name.startswith("chunks/") and name.endswith(".rows") for name in before)
-
-    assert main(["resume", "out", "--mended"]) == 0
-
-    assert result_of(here / "out") == result_of(here / "undisturbed")
-    assert modules_of(here / "out") == {"own_detector": sha256(DETECTOR)}
-    manifest = json.loads((here / "out" / "manifest.json").read_text())
-    assert manifest["mended"] == [{"module": "own_detector", "sha256": sha256(faulty)}]
 
 
 def test_replay_names_the_modules_that_have_changed_where_it_finds_a_difference(
