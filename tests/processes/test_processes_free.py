@@ -131,7 +131,7 @@ def test_what_a_small_backlog_drops_while_knowledge_is_away_is_one_row(here):
     # What is missing is in one row per gap: between two of them something was logged.
     missing = [number for first, final in dropped for number in range(first, final + 1)]
     assert missing == sorted({*range(1, total + 1)} - {*logged})
-    assert reached < dropped[0][0]
+    assert reached < dropped[-1][0]  # a machine that stands still for a moment makes gaps of its own
     assert all(final + 1 < first for (_, final), (first, _) in pairwise(dropped))
     counts = [final - first + 1 for first, final in dropped]
     assert status.dropped in accumulate(counts)
