@@ -104,7 +104,7 @@ def test_a_restarted_execute_puts_the_plans_in_force_that_came_while_it_was_behi
 
 def test_behind_a_rate_that_cannot_be_reached_plans_and_acknowledgements_are_heard(here):
     """In processes: on threads Execute would keep the others from their work."""
-    backlog, total = 200, 4000
+    backlog, total = 200, 8000
     config = write_config(here, json.loads(free(total, 1e5, backlog, "python").to_json()) | {"analyze": "changes"})
     with up(config) as running:
         result = running.result()
@@ -118,7 +118,7 @@ def test_behind_a_rate_that_cannot_be_reached_plans_and_acknowledgements_are_hea
     # Who hears nothing fills its backlog once, and drives on under plan 0.
     assert len(seen) > 2 * backlog
     assert plans[-1] > backlog
-    assert len(plans) > 10
+    assert len(plans) > 2
     # Once full, the backlog is half empty before it takes again: gaps are few, and not one for each place.
     between = [after - final - 1 for (_, final), (after, _) in pairwise(gaps)]
     assert all(taken >= backlog // 2 for taken in between), between
