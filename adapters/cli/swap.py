@@ -33,7 +33,7 @@ def execute(chosen: argparse.Namespace) -> int:
         # A question that nobody hears ends at once, and one that was heard must not be asked twice.
         deadline = time.monotonic() + THERE_WITHIN
         while not _is_there(role, session, wire) and time.monotonic() < deadline:
-            time.sleep(0.05)
+            time.sleep(0.05)  # Knowledge tells who is there when it is asked
         said = None
         for reply in session.get(wire.control(role), payload=control, timeout=ANSWERED_WITHIN):
             if reply.ok is not None:
