@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from gymnasium.envs.registration import registry
 from hypothesis import HealthCheck, settings
 
 # pytest puts this folder on the path, where the folders `knowledge` and `mape` would be taken for the packages; the
@@ -73,3 +74,18 @@ def pytest_runtest_teardown(item):
 @pytest.hookimpl(tryfirst=True)
 def pytest_timeout_cancel_timer():
     faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.fixture
+def own_folder(tmp_path, monkeypatch):
+    """An empty current folder for modules of a user's own; they and their environments are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    importlib.invalidate_caches()
+    modules, environments = set(sys.modules), dict(registry)
+    yield tmp_path
+    registry.clear()
+    registry.update(environments)
+    for name in set(sys.modules) - modules:
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
+            del sys.modules[name]

@@ -240,18 +240,23 @@ def _manifest(folder: Path) -> Mapping[str, Any]:
     return read_manifest(folder) if (folder / "manifest.json").exists() else {}
 
 
-def _other_code(then: Mapping[str, str], manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return versions, and hashes of modules of the user's own, then and now, where they are not the same."""
+def _changed_versions(then: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return name -> versions then and now, where they are not the same."""
     now = versions()
+    return {name: [then[name], now[name]] for name in now if name in then and then[name] != now[name]}
+
+
+def _other_code(then: Mapping[str, str], manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what has changed since, for JSON: versions, and hashes of modules of the user's own."""
     return {
-        "versions": {name: [then[name], now[name]] for name in now if name in then and then[name] != now[name]},
+        "versions": _changed_versions(then),
         "modules": {other.module: [other.then, other.now] for other in other_versions(manifest.get(MODULES) or {})},
         "mended": manifest.get(MENDED, []),
     }
 
 
 def _print_other_code(then: Mapping[str, str], manifest: Mapping[str, Any]) -> None:
-    if others := _other_code(then, manifest)["versions"]:
+    if others := _changed_versions(then):
         told = ", ".join(f"{name} {was} then, {is_now} now" for name, (was, is_now) in others.items())
         print(f"bits are equal for equal versions only: {told}")
     for other in other_versions(manifest.get(MODULES) or {}):

@@ -52,7 +52,10 @@ def terminated_by_signal() -> Iterator[None]:
         threading.Timer(0.01, os.kill, (os.getpid(), signals[lost])).start()
 
     def lost_in_a_finaliser(lost: Any) -> None:
-        raise_again(lost.exc_type) if lost.exc_type in signals else hook(lost)
+        if lost.exc_type in signals:
+            raise_again(lost.exc_type)
+        else:
+            hook(lost)
 
     def not_of_a_signal(record: logging.LogRecord) -> bool:
         # Of what a callback raises, Zenoh makes a line of its log; those of a session run in this thread too.

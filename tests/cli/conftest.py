@@ -1,12 +1,9 @@
 """The command line in this process, from an empty folder, without traces of one test in the next."""
 
-import importlib
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from gymnasium.envs.registration import registry
 
 from adapters.cli.main import main
 
@@ -20,18 +17,9 @@ collect_ignore = ["conftest.py"]
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def here(own_folder: Path) -> Path:
     """An empty current folder, whose modules and environments are forgotten afterwards."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    importlib.invalidate_caches()
-    modules, environments = set(sys.modules), dict(registry)
-    yield tmp_path
-    registry.clear()
-    registry.update(environments)
-    for name in set(sys.modules) - modules:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
-            del sys.modules[name]
+    return own_folder
 
 
 @pytest.fixture

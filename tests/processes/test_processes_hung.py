@@ -45,7 +45,7 @@ class Clock:
         monkeypatch.setattr(presence, "time", SimpleNamespace(monotonic=lambda: self.now))
 
     def sleep(self, seconds):
-        time.sleep(0.002)
+        time.sleep(0.002)  # for the threads of Zenoh, and for children that are to die
         self.now += 0.0 if self.stands else seconds
 
 

@@ -1,15 +1,13 @@
 """A run with parts of the user's own: the folder keeps which version of them it is, and mixes no two."""
 
 import hashlib
-import importlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
 import pytest
-from gymnasium.envs.registration import registry
 from real_runs import contents, result_of
 
 from adapters.cli.main import main
@@ -41,20 +39,11 @@ RUN = ("run", "own.toml", *WATCHED, "--no-figures", "-q", "--workers", "1")
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def here(own_folder: Path) -> Path:
     """A folder with a config and a detector, whose modules and environments are forgotten afterwards."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    importlib.invalidate_caches()
-    modules, environments = set(sys.modules), dict(registry)
-    (tmp_path / "own.toml").write_text(CONFIG)
-    (tmp_path / "own_detector.py").write_text(DETECTOR)
-    yield tmp_path
-    registry.clear()
-    registry.update(environments)
-    for name in set(sys.modules) - modules:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(tmp_path)):
-            del sys.modules[name]
+    (own_folder / "own.toml").write_text(CONFIG)
+    (own_folder / "own_detector.py").write_text(DETECTOR)
+    return own_folder
 
 
 def sha256(text: str) -> str:
