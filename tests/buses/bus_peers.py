@@ -14,7 +14,7 @@ from bus_records import MAKERS, TOLD, new_ledger
 from adapters.buses import KnowledgeHub, Member
 from adapters.buses.member import Asked
 from adapters.buses.messages import Join, Status
-from adapters.buses.wire import ORDERED, role_of
+from adapters.buses.wire import INPUT, ORDERED, role_of
 from adapters.roles import ROLES
 
 HERE = Path(__file__).parent
@@ -158,3 +158,24 @@ def ended(process, within=30):
         out, err = process.communicate()
         pytest.fail(f"the process did not end within {within} s; it said {out!r} and {err!r}")
     return process.returncode, out, err
+
+
+def of(role, records):
+    """Pick what a role takes."""
+    return [record for record in records if type(record) is INPUT[role]]
+
+
+def lose(monkeypatch, site, wanted):
+    """Let Knowledge not hear what `wanted` names, once each."""
+    lost, true_append = [], site.hub.answers.append
+
+    def append(query):
+        data = query.payload.to_bytes()
+        if data not in lost and wanted(data):
+            lost.append(data)
+            query.drop()
+            return None
+        return true_append(query)
+
+    monkeypatch.setattr(site.hub.answers, "append", append)
+    return lost

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from adapters.buses import Wire
+from adapters.buses import Wire, member, outbox
 
 # pytest imports test modules without a path to their neighbours; `bus_records` and `bus_peers` are such.
 sys.path.append(str(Path(__file__).parent))
+
+from bus_peers import Site
 
 
 class _Collect(logging.Handler):
@@ -39,3 +41,27 @@ def endpoint(tmp_path_factory):
 @pytest.fixture
 def wire(endpoint):
     return Wire(endpoint, "example")
+
+
+@pytest.fixture
+def site(wire, tmp_path):
+    with Site(wire, tmp_path / "log.sqlite") as site:
+        yield site
+
+
+@pytest.fixture
+def raw(site):
+    return site.session()
+
+
+@pytest.fixture
+def all_four(site):
+    return site.everybody()
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """What was lost is sent again, and asked for, after a moment."""
+    monkeypatch.setattr(outbox, "RESEND_AFTER", 0.02)
+    monkeypatch.setattr(outbox, "REPEAT_AFTER", 0.01)
+    monkeypatch.setattr(member, "KEEP_UP_EVERY", 0.01)

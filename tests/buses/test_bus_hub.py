@@ -29,11 +29,6 @@ def site(wire, tmp_path):
 
 
 @pytest.fixture
-def raw(site):
-    return site.session()
-
-
-@pytest.fixture
 def joined(site, raw):
     """Let every role join once, so that each has the epoch 1."""
     for role in STAGE_OF:

@@ -25,11 +25,6 @@ def site(wire, tmp_path):
         yield site
 
 
-@pytest.fixture
-def raw(site):
-    return site.session()
-
-
 def swapped(part, number, **other):
     return Swapped(loop=0, pass_no=number, part=part, to={"name": "own:Anything"}, **other).pack()
 
