@@ -94,6 +94,20 @@ class Corridor:
         pass
 
 
+class Carrying(Corridor):
+    """Its reward grows from episode to episode."""
+
+    played = 0
+
+    def begin(self, episode):
+        self.played += 1
+        return super().begin(episode)
+
+    def step(self, action, context):
+        state, _, ended, truncated = super().step(action, context)
+        return state, float(self.played), ended, truncated
+
+
 class Standing(Corridor):
     """Never leaves its state; rewards are high, then low, so that its values rise and fall within an episode."""
 

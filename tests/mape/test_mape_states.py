@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mape_configs import EPISODES, configs, gridworlds, junctions
-from mape_runs import GRID, TRAFFIC, Corridor, config, corridor_loop, hashes, loop_of
+from mape_runs import GRID, TRAFFIC, Carrying, Corridor, config, corridor_loop, hashes, loop_of
 
 from adapters.systems import make_system
 from knowledge import STAGES, ChangePlan, Observation, QTable
@@ -25,18 +25,8 @@ CALLED = {
 }
 
 
-class Counting(Corridor):
-    """Its reward grows from episode to episode, and it says how far it is."""
-
-    played = 0
-
-    def begin(self, episode):
-        self.played += 1
-        return super().begin(episode)
-
-    def step(self, action, context):
-        state, _, ended, truncated = super().step(action, context)
-        return state, float(self.played), ended, truncated
+class Counting(Carrying):
+    """It says how far it is."""
 
     def get_state(self):
         return {"played": self.played, "enabled": list(self.enabled)}

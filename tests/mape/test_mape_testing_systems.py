@@ -7,7 +7,7 @@ import faulty_rules
 import numpy as np
 import pytest
 from faulty_parts import MEMBERS, faults, variant, without
-from mape_runs import Corridor
+from mape_runs import Carrying, Corridor
 
 from adapters.systems import make_system
 from mape.config import SystemConfig
@@ -70,20 +70,6 @@ class Walk(Corridor):
     def step(self, action, context):
         self._cell, reward, ended = self.by_step(self.rules.params, 0, self._cell, action, None, 0, context)
         return self._cell, reward, ended, False
-
-
-class Carrying(Corridor):
-    """Its reward grows from episode to episode."""
-
-    played = 0
-
-    def begin(self, episode):
-        self.played += 1
-        return super().begin(episode)
-
-    def step(self, action, context):
-        state, _, ended, truncated = super().step(action, context)
-        return state, float(self.played), ended, truncated
 
 
 class Stateful(Carrying):
