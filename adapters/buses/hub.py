@@ -151,10 +151,8 @@ class KnowledgeHub:
         worker.join()
         self._worker = None
         with suppress(Empty):
-            while True:  # what came in between is dropped unanswered; its sender asks again
-                if isinstance((left := self._asked.get_nowait() or ("", None))[1], zenoh.Query):
-                    with left[1]:
-                        pass
+            while True:  # what came in between; its sender asks again
+                _leave_unanswered(self._asked.get_nowait())
 
     # The worker.
 
@@ -163,20 +161,17 @@ class KnowledgeHub:
         while asked is not None:
             answers: list[Answer] = []
             try:
-                for _ in range(AT_ONCE):
-                    self._hear(*asked, answers)
-                    asked = self._asked.get_nowait()
-                    if asked is None:
-                        break
-            except Empty:
-                asked = ("", None)
-            except ResultsError as error:
-                self._fail(error, answers)
-                return
-            try:
+                try:
+                    for _ in range(AT_ONCE):
+                        self._hear(*asked, answers)
+                        asked = self._asked.get_nowait()
+                        if asked is None:
+                            break
+                except Empty:
+                    asked = ("", None)
                 self.ledger.commit()
             except ResultsError as error:
-                self._fail(error, answers)
+                self._fail(error, asked, answers)
                 return
             for answer in answers:
                 self._say(answer)
@@ -187,12 +182,12 @@ class KnowledgeHub:
             if asked == ("", None):
                 asked = self._asked.get()
 
-    def _fail(self, error: ResultsError, answers: list[Answer]) -> None:
-        # The logs in memory are ahead of the disk: nothing more can be said that would be true.
+    def _fail(self, error: ResultsError, asked: tuple[str, Any] | None, answers: list[Answer]) -> None:
+        # The logs in memory are ahead of the disk: nothing more can be said that would be true. Who asked is told
+        # nothing, and waits for the next Knowledge, as it would if this one had been killed.
         self.failure = error
-        for answer in answers:
-            with suppress(Exception), answer.query:
-                answer.query.reply_err(str(error))
+        for unanswered in (asked, *(("", answer.query) for answer in answers)):
+            _leave_unanswered(unanswered)
         self.ended.set()
 
     def _say(self, answer: Answer) -> None:
@@ -267,3 +262,14 @@ class KnowledgeHub:
                     return
         with suppress(zenoh.ZError), query:
             query.reply_err(f"later: {said}")
+
+
+def _leave_unanswered(asked: tuple[str, Any] | None) -> None:
+    """Let who asked, if it was a question, know that nothing comes: it asks again."""
+    if asked is None:
+        return
+    kind, what = asked
+    query = what[0] if kind == "table" else what
+    if isinstance(query, zenoh.Query):
+        with query:
+            pass

@@ -1,7 +1,8 @@
 """Starts the five processes of a run on this machine, watches them, and starts them again when they die.
 
 Who died by a signal is started again at once. Who ended with an error gets one more try, for the error may have been
-the world's; where it comes again at the same place, the run ends with it. Who is alive and says nothing for too long is
+the world's; where it comes again at the same place, the run ends with it. So it does where Knowledge fails again soon:
+with the disk full, each start of it makes room for a few passes more. Who is alive and says nothing for too long is
 hung: it is killed, and started again.
 
 All are started at once, and the roles hold until Knowledge, the one that was started here, has answered: at the same
@@ -44,6 +45,9 @@ STARTS_WITHIN = 30.0
 CRASHES = 10
 """So many deaths of one role without a pass in between, and the run is given up."""
 
+KEEPS_FAILING = 60.0
+"""Seconds within which a second error of Knowledge is the first one's, however many passes lie between."""
+
 FRESH = 3.0
 """Seconds for which Knowledge's word on who is hung is believed."""
 
@@ -72,7 +76,7 @@ class Child:
         self.process: subprocess.Popen[bytes] | None = None
         self.started_at = 0.0
         self.deaths: deque[tuple[float, int]] = deque(maxlen=CRASHES)
-        self.errors = 0
+        self.failed: tuple[float, int] | None = None  # when it last ended with an error, and after how many passes
         self.hung = 0
         self.killed = False  # it may take a moment until it is gone
         self.released = False
@@ -239,9 +243,9 @@ class Supervisor:
         now = time.monotonic()
         child.deaths.append((now, self._passes))
         if code >= 0:
-            child.errors += 1
-            if child.errors > 1 and child.deaths[-2][1] == self._passes:
-                raise Failed(f"{child.role} failed twice at the same place: {self._failure(child, code)}")
+            before, child.failed = child.failed, (now, self._passes)
+            if before is not None and (again := self._again(child, *before)):
+                raise Failed(f"{child.role} failed twice {again}: {self._failure(child, code)}")
         if len(child.deaths) == CRASHES and child.deaths[0][1] == self._passes:
             raise Failed(
                 f"{child.role} died {CRASHES} times within {now - child.deaths[0][0]:.0f} s, without a pass in between "
@@ -255,6 +259,14 @@ class Supervisor:
             return True
         status = self.status
         return status is not None and status.roles[child.role].last_pass >= status.episodes
+
+    def _again(self, child: Child, failed_at: float, passes: int) -> str:
+        """Say in how far an error is the last one again; empty if it is another."""
+        if passes == self._passes:
+            return "at the same place"
+        assert child.failed is not None
+        apart = child.failed[0] - failed_at
+        return f"within {apart:.0f} s" if child.role == KNOWLEDGE and apart < KEEPS_FAILING else ""
 
     @staticmethod
     def _failure(child: Child, code: int) -> str:
@@ -326,8 +338,6 @@ class Supervisor:
         self._heard_at = self._now()
         if self.status.passes > self._passes:
             self._passes = self.status.passes
-            for child in self.children.values():
-                child.errors = 0
 
     def _tell_unreached(self, now: float) -> None:
         started = self.children[KNOWLEDGE].started_at

@@ -60,7 +60,7 @@ class Site:
         for record in records:
             member = self.members[role_of(type(record))]
             member.send(record)
-            member.settle(10)
+            member.settle(60)
 
     def __enter__(self):
         return self
@@ -70,7 +70,7 @@ class Site:
         self.close()
 
 
-def received(member, count, within=10.0):
+def received(member, count, within=60.0):
     """Return the next records that come, `count` of them, and see that none comes behind."""
     got, deadline = [], time.monotonic() + within
     while len(got) < count:
@@ -84,7 +84,7 @@ def received(member, count, within=10.0):
 
 def ask(session, selector, payload=None, attachment=None):
     """Return (reply, error reply) of the one answer that comes."""
-    (answer,) = session.get(selector, payload=payload, attachment=attachment, timeout=8, **ORDERED)
+    (answer,) = session.get(selector, payload=payload, attachment=attachment, timeout=60, **ORDERED)
     return (answer.ok.payload.to_bytes(), None) if answer.ok else (None, answer.err.payload.to_string())
 
 
@@ -99,7 +99,7 @@ def join_of(role, **other):
     return Join(role=role, **{**fields, **other}).pack()
 
 
-def eventually(condition, within=10.0):
+def eventually(condition, within=60.0):
     deadline = time.monotonic() + within
     tick = threading.Event()
     while not condition():
@@ -133,7 +133,7 @@ def play_part(member, loop, passes, stop=lambda: False):
             member.send(MAKERS[stage](number, loop=loop))
         if came.pass_no == passes:
             break
-    member.settle(10)
+    member.settle(60)
     return got
 
 
@@ -149,7 +149,7 @@ def start(program, *arguments):
     )
 
 
-def ended(process, within=30):
+def ended(process, within=60):
     """Return (exit code, stdout, stderr) of a process that is expected to end by itself."""
     try:
         out, err = process.communicate(timeout=within)

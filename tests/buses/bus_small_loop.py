@@ -71,7 +71,7 @@ class Distributed:
 
     def join(self):
         for thread in self.threads:
-            thread.join(40)
+            thread.join(60)
         assert self.failed == []
 
     def close(self):

@@ -171,11 +171,11 @@ class Target(Site):
                 else:
                     self.expected_of[ROLES[(ROLES.index(role) + 1) % 4]] += 1
             else:
-                asked = self.raw.get(key, payload=payload, attachment=attachment, timeout=20, **ORDERED)
+                asked = self.raw.get(key, payload=payload, attachment=attachment, timeout=60, **ORDERED)
                 answers.append((kind, key, payload, asked))
                 if kind == "control":
                     self.expected_of[key.split("/")[-1]] += 1
-        eventually(self.all_refused, within=20)
+        eventually(self.all_refused, within=60)
         for kind, key, payload, asked in answers:
             (answer,) = list(asked)
             if kind == "read" and answer.ok is not None:

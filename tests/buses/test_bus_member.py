@@ -60,13 +60,13 @@ def test_a_record_is_sent_on_without_waiting_for_the_one_before(site, all_four):
     with pytest.MonkeyPatch.context() as patch:
         held = threading.Event()
         true_take = site.ledger.take
-        patch.setattr(site.ledger, "take", lambda *given: (held.wait(10), true_take(*given))[1])
+        patch.setattr(site.ledger, "take", lambda *given: (held.wait(60), true_take(*given))[1])
         for number in range(1, 4):
             execute.send(observation(number))
         assert execute.unacknowledged(0) == 3
         held.set()
     all_four["plan"].send(plan(0))
-    all_four["plan"].settle(10)
+    all_four["plan"].settle(60)
     assert execute.unacknowledged(0) >= 2  # they came before their time, and are kept
 
 
@@ -148,7 +148,7 @@ def test_where_one_is_lost_those_behind_it_are_sent_again_too(wire, impatient, m
         execute = site.members["execute"]
         for number in range(1, 101):
             execute.send(observation(number))
-        execute.settle(10)
+        execute.settle(60)
         assert lost == [to_json(observation(2)), to_json(observation(30))]
         assert site.ledger.last(0) == (100, 0, 0, 0)
 
@@ -227,7 +227,7 @@ def test_a_malformed_question_to_a_role_is_refused_and_counted(site, all_four, p
         reply, error = ask(asking, site.wire.control("monitor"), payload)
     finally:
         stop.set()
-        server.join(10)
+        server.join(60)
     assert reply is None
     assert error
     assert reader.refused == 1
@@ -254,7 +254,7 @@ def test_a_conflict_comes_out_of_settling(site, all_four):
     with pytest.raises(
         Refused, match=r"plan is refused by Knowledge: ChangePlan 0 of loop 0 differs .*epsilon is 0\.5"
     ):
-        all_four["plan"].settle(10)
+        all_four["plan"].settle(60)
 
 
 def test_a_refusal_comes_out_of_receiving(site, all_four):
@@ -276,7 +276,7 @@ def test_one_that_was_superseded_is_told_so(site, all_four):
     assert (old.joined.epoch, new.joined.epoch) == (1, 2)
     old.send(plan(0))
     with pytest.raises(Refused, match=r"another plan has joined since \(epoch 2; this one has 1\)"):
-        old.settle(10)
+        old.settle(60)
     for forbidden in (
         lambda: old.keep_surely(State(loop=0, pass_no=0, state={})),
         lambda: old.swapped(Swapped(loop=0, pass_no=1, part="plan", to={})),
@@ -284,7 +284,7 @@ def test_one_that_was_superseded_is_told_so(site, all_four):
         with pytest.raises(Refused, match="another plan has joined since"):
             forbidden()
     new.send(plan(0))
-    new.settle(10)
+    new.settle(60)
 
 
 def test_who_has_another_config_does_not_join(wire):
@@ -312,7 +312,7 @@ def test_one_that_finds_nobody_waits_and_says_for_whom(wire):
     eventually(lambda: said)
     assert said == [f"waiting for Knowledge on {wire.endpoint}"]
     with Site(wire, begun=True):
-        joining.join(10)
+        joining.join(60)
         assert joined == [1]
     assert len(said) == 1
 
@@ -330,7 +330,7 @@ def test_one_that_has_no_layout_waits_for_execute_and_says_so(site):
     assert said == ["waiting for Execute, which has the managed system"]
     assert joined == []
     site.member("execute")
-    joining.join(10)
+    joining.join(60)
     assert joined == [TOLD]
 
 

@@ -47,7 +47,7 @@ def test_a_state_travels_with_its_record(site, all_four):
     site.send(plan(0))
     state = State(loop=0, pass_no=1, state={"rng": 5})
     all_four["execute"].send(observation(1), state.pack(a_table()))
-    all_four["execute"].settle(10)
+    all_four["execute"].settle(60)
     again, table = all_four["execute"].snapshot(0)
     assert (again, table.sha256()) == (state, a_table().sha256())
 
@@ -75,7 +75,7 @@ def test_a_table_of_an_episode_is_asked_of_execute_once(site, all_four):
         first = all_four["plan"].table("loop=0;pass=3")
     finally:
         stop.set()
-        server.join(10)
+        server.join(60)
     again = all_four["plan"].table("loop=0;pass=3")
     assert first.sha256() == again.sha256() == a_table(7).sha256()
     assert asked == [Control(what="q_table", loop=0, pass_no=3)]
@@ -95,7 +95,7 @@ def test_what_is_no_table_is_not_handed_on(site, all_four, reply):
             all_four["plan"].ask("table?loop=0;pass=3", deadline=0.0)
     finally:
         stop.set()
-        server.join(10)
+        server.join(60)
 
 
 def test_a_table_is_asked_for_again_while_execute_is_away(site):

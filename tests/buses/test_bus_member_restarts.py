@@ -25,12 +25,12 @@ def test_nothing_is_lost_and_nothing_comes_twice_over_restarts_of_knowledge(site
     for player in players:
         player.start()
     for reached in (10, 25, 40):
-        eventually(lambda reached=reached: site.ledger.last(0)[3] >= reached, within=20)
+        eventually(lambda reached=reached: site.ledger.last(0)[3] >= reached, within=60)
         site.close()
         site.open()
         assert site.ledger.last(0)[3] >= reached
     for player in players:
-        player.join(30)
+        player.join(60)
     assert got == {role: of(role, run_of(passes)) for role in ROLES}
     site.close()
     log = new_ledger(site.path)
@@ -49,7 +49,7 @@ def test_what_was_sent_while_knowledge_was_away_is_appended_when_it_is_back(wire
         for number in range(1, 200):
             site.members["execute"].send(observation(number))
         site.open()
-        site.members["execute"].settle(20)
+        site.members["execute"].settle(60)
         assert site.ledger.last(0) == (199, 0, 0, 0)
 
 
@@ -59,7 +59,7 @@ def test_one_that_sends_to_a_knowledge_that_lost_its_log_stops_with_a_sentence(s
     site.open(tmp_path / "another.sqlite")
     all_four["execute"].send(observation(3))
     with pytest.raises(Refused, match=r"no execute of epoch 1 has joined this Knowledge; was its log lost\?"):
-        all_four["execute"].settle(20)
+        all_four["execute"].settle(60)
 
 
 def test_one_that_only_waits_on_a_knowledge_that_lost_its_log_stops_too(site, all_four, tmp_path):
@@ -69,7 +69,7 @@ def test_one_that_only_waits_on_a_knowledge_that_lost_its_log_stops_too(site, al
     site.close()
     site.open(tmp_path / "another.sqlite")
     with pytest.raises(Refused, match="the run has not begun"):
-        received(all_four["monitor"], 1, within=20)
+        received(all_four["monitor"], 1, within=60)
 
 
 def test_one_whose_log_is_an_older_one_stops_with_a_sentence(site, all_four, tmp_path):
@@ -83,7 +83,7 @@ def test_one_whose_log_is_an_older_one_stops_with_a_sentence(site, all_four, tmp
     site.open(old)
     all_four["execute"].send(observation(4))
     with pytest.raises(Refused, match="had Observation 3 of loop 0 from execute, and has them up to 1 only"):
-        all_four["execute"].settle(20)
+        all_four["execute"].settle(60)
 
 
 def test_a_record_that_is_lost_behind_dropped_episodes_is_sent_again(wire, impatient, monkeypatch):
@@ -97,7 +97,7 @@ def test_a_record_that_is_lost_behind_dropped_episodes_is_sent_again(wire, impat
         lost = lose(monkeypatch, site, lambda data: data == to_json(symptom(10)))
         monitor.send(symptom(10))
         monitor.send(symptom(11))
-        monitor.settle(10)
+        monitor.settle(60)
         assert lost == [to_json(symptom(10))]
         assert site.ledger.last(0) == (11, 11, 0, 0)
 
@@ -112,7 +112,7 @@ def test_dropped_episodes_are_said_and_a_reader_goes_past_them(wire, impatient, 
         execute.drop(0, 2, 9)
         execute.send(observation(10))
         execute.send(observation(11))
-        execute.settle(10)
+        execute.settle(60)
         assert len(lost) == 1
         assert received(monitor, 3) == [observation(1), observation(10), observation(11)]
         assert status(site.session(), wire).dropped == 8
@@ -131,7 +131,7 @@ def test_one_whose_link_stands_and_is_dead_opens_another_session(site, all_four,
         site.hub, "_hear", lambda *given: true_hear(*given) if heard.is_set() else unheard.append(given)
     )
     first = planner._session
-    eventually(lambda: planner.receive(0.01) is not None or planner._session is not first, within=20)
+    eventually(lambda: planner.receive(0.01) is not None or planner._session is not first, within=60)
     heard.set()
     site.send(*run_of(1)[1:])
     assert received(planner, 1) == of("plan", run_of(1))
@@ -146,14 +146,14 @@ def test_one_that_waits_for_a_busy_knowledge_keeps_its_session(site, all_four, m
     for module in (inbox, outbox, questions):
         monkeypatch.setattr(module, "ANSWER_WITHIN", 0.1)
     held, true_take = threading.Event(), site.ledger.take
-    monkeypatch.setattr(site.ledger, "take", lambda *given: (held.wait(10), true_take(*given))[1])
+    monkeypatch.setattr(site.ledger, "take", lambda *given: (held.wait(60), true_take(*given))[1])
     planner, first, lost = all_four["plan"], all_four["plan"]._session, []
     true_lost = planner._lost
     monkeypatch.setattr(planner, "_lost", lambda: (lost.append(1), true_lost()))
     planner.send(plan(0))
     eventually(lambda: planner.receive(0.01) is not None or len(lost) >= 3)
     held.set()
-    planner.settle(10)
+    planner.settle(60)
     assert planner._session is first
 
 

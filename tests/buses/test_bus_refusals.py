@@ -120,7 +120,7 @@ def test_the_final_state_of_execute_at_the_last_pass_completes_a_run(site, raw):
     site.send(*run_of(EPISODES))
     final = State(loop=0, pass_no=EPISODES, state={}, final=True).pack(QTable((0, 1), 2))
     assert ask(raw, site.wire.ask("snapshot/execute"), final, b"2")[1] is None
-    assert site.hub.ended.wait(10)
+    assert site.hub.ended.wait(60)
 
 
 # Events.

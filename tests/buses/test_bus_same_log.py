@@ -54,7 +54,7 @@ def test_it_is_the_same_after_restarts_of_knowledge(wire, tmp_path):
 
     def restart(site):
         for reached in (10, 30):
-            eventually(lambda reached=reached: site.ledger.last(0)[3] >= reached, within=20)
+            eventually(lambda reached=reached: site.ledger.last(0)[3] >= reached, within=60)
             site.close()
             site.open()
 
@@ -67,10 +67,10 @@ def test_a_question_about_a_loop_that_is_not_there_does_not_stop_execute(wire, t
     answers = []
 
     def question(site):
-        eventually(lambda: site.ledger.epoch("execute") == 1, within=20)
+        eventually(lambda: site.ledger.epoch("execute") == 1, within=60)
         with wire.join("operator", 5) as raw:
             control = Control(what="q_table", loop=99, pass_no=1).pack()
-            eventually(lambda: answers.extend(raw.get(wire.control("execute"), payload=control)) or answers, within=10)
+            eventually(lambda: answers.extend(raw.get(wire.control("execute"), payload=control)) or answers, within=60)
 
     _, (digest,), _ = run_over(wire, tmp_path / "l", config, question)
     assert "loop 99; this run has loops 0 to 0" in answers[0].err.payload.to_string()

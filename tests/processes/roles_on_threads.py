@@ -64,7 +64,7 @@ class Roles(Distributed):
         for role in self.roles.values():
             role.stopping.set()
         for thread in self.threads:
-            thread.join(10)
+            thread.join(60)
         self._stack.close()
         self.close()
 
@@ -77,7 +77,7 @@ class Roles(Distributed):
         self.roles[name].stopping.set()
         for thread in self.threads:
             if thread.name == name:
-                thread.join(20)
+                thread.join(60)
 
     def again(self, name):
         self.end(name)
@@ -97,7 +97,7 @@ class Roles(Distributed):
             assert self.failed == []
             return condition()
 
-        return until(come_true_or_failed, what, within=30.0)
+        return until(come_true_or_failed, what, within=60.0)
 
     def wanted(self, name):
         """Whether a part has been let in that has not served yet."""
@@ -107,7 +107,7 @@ class Roles(Distributed):
     def ask_for(self, part, to, role):
         """Ask a role for another part; return what gives the answer once it is there."""
         payload = Control(what="swap", part=part, to=to).pack()
-        answers = self.operator.get(self.wire.control(role), payload=payload, timeout=20)
+        answers = self.operator.get(self.wire.control(role), payload=payload, timeout=60)
 
         def answer():
             (reply,) = answers

@@ -88,7 +88,7 @@ class Watched:
     def _speak(self, role, pid):
         """Say in the name of a role that it is there, and see it heard."""
         if role in self.joining and self._pids.get(role) != pid:
-            (answer,) = self.raw.get(self.wire.ask(f"join/{role}"), payload=join_of(role, pid=pid), timeout=20)
+            (answer,) = self.raw.get(self.wire.ask(f"join/{role}"), payload=join_of(role, pid=pid), timeout=60)
             self._epochs[role] = Joined.unpack(answer.ok.payload.to_bytes())[0].epoch
             self._pids[role] = pid
         if role in self.speaking:

@@ -37,7 +37,7 @@ def test_up_that_listens_on_all_addresses_is_reached_by_its_own_roles(here, conf
 )  # fmt: skip
 def test_up_at_an_address_that_its_keys_do_not_hold_for_is_refused_at_once(here, config, port, host, why):
     with up(config, "--tls", "keys", at=f"tcp/{host}:{port}") as running:
-        said = running.process.end(2, 20.0)
+        said = running.process.end(2, 60.0)
         assert re.search(why, said), said
         assert not running.out.exists()
 

@@ -149,7 +149,7 @@ def test_a_role_whose_system_exits_by_itself_fails_with_a_sentence(here, where, 
     config = str(write_config(here, {"name": "leaves", "episodes": 80, "system": system}))
     nowhere = ("--connect", "tcp/[::1]:7447", "--tls", "keys")
     with started("serve", config, "--role", "execute", *nowhere, cwd=here) as execute:
-        said = execute.end(code, 30.0)
+        said = execute.end(code, 60.0)
     assert "SystemExit" in said or "sys.exit(0)" in said
     assert "Traceback" not in said
 
@@ -167,7 +167,7 @@ def test_who_leaves_before_the_run_is_over_is_started_again(here, monkeypatch):
 def test_who_leaves_again_and_again_ends_the_run_with_a_sentence_that_names_the_way_on(here, monkeypatch):
     config = leaving(here, monkeypatch, again=True)
     with up(config) as running:
-        said = running.process.end(1, 40.0)
+        said = running.process.end(1, 60.0)
     assert "execute failed twice at the same place: it ended as if all were done" in said
     assert said.count("kept") == 1
     assert "`mapek resume up` continues." in said
@@ -176,8 +176,11 @@ def test_who_leaves_again_and_again_ends_the_run_with_a_sentence_that_names_the_
 def test_a_full_disk_names_the_folder_with_which_to_go_on_once(here):
     config = gridworld(here, 2000)
     with up(config, start=little_room(200_000)) as running:
-        said = running.process.end(1, 40.0)
-    assert "failed twice at the same place" in said  # Knowledge, or who was told by it
+        said = running.process.end(1, 60.0)
+    assert re.search("knowledge failed twice (at the same place|within [0-9]+ s): up/log.sqlite cannot be", said), said
+    # A role is none the worse for it: to start all of them again, each at its next question, took half a minute.
+    assert [event.role for event in events(running.log, "joined")].count("execute") == 1
+    assert len(events(running.log, "joined")) == len(ROLES) - 1
     assert (said.count("mapek resume"), said.count("kept")) == (1, 1), said
     assert "`mapek resume up`" in said
 
@@ -188,7 +191,7 @@ def test_a_role_of_another_system_is_refused_with_the_difference(here):
         running.wait_for_pass(5)
         traffic = str(EXAMPLES / "traffic.toml")
         with started("serve", traffic, "--role", "plan", "--connect", running.endpoint, cwd=here) as stranger:
-            said = stranger.end(2, 30.0)
+            said = stranger.end(2, 60.0)
     assert "system.id is 'mapek/TrafficJunction-v0' in plan, and 'mapek/Gridworld-v0' in Knowledge" in said
 
 
@@ -201,7 +204,7 @@ def test_the_first_difference_told_is_none_that_is_only_for_people(here):
         for change, difference in (({"loops": 3}, "loops is 3 in plan, and 1"), ({}, "name is 'other' in plan")):
             other = write_config(here, theirs | change, "other.json")
             with started("serve", str(other), "--role", "plan", "--connect", endpoint(here), cwd=here) as stranger:
-                assert difference in stranger.end(2, 30.0)
+                assert difference in stranger.end(2, 60.0)
 
 
 def test_a_knowledge_that_cannot_listen_leaves_no_folder(here):

@@ -99,7 +99,7 @@ def test_a_system_is_closed_when_its_process_is_ended_or_fails(here, over, monke
         assert Plant.open == []
         monkeypatch.setattr(Plant, "fails_at", max(number for number in Plant.done if number != "closed") + 4)
         run.start("execute")
-        run.threads[-1].join(30)
+        run.threads[-1].join(60)
         (error,) = run.failed
         assert isinstance(error, ManagedSystemError)
         assert "the valve is stuck" in str(error)

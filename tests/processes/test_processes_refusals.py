@@ -46,7 +46,7 @@ def gridworld(here, *overrides):
 
 def sentence(process: Started, code: int) -> str:
     """The one thing that was said for people, beside lines of the log."""
-    said = [line for line in process.end(code, 20.0).splitlines() if line.startswith("mapek: ")]
+    said = [line for line in process.end(code, 60.0).splitlines() if line.startswith("mapek: ")]
     assert len(said) == 1, process.said
     assert "Traceback" not in process.said
     return said[0]
@@ -72,7 +72,7 @@ def test_who_does_not_belong_to_a_run_is_told_and_nobody_is_disturbed(here):
             with started(*arguments, cwd=here, start=start, name="stranger") as stranger:
                 assert said in sentence(stranger, code)
         reached = running.passes()
-        until(lambda: running.passes() > reached + 50, "the run to go on", 20.0)
+        until(lambda: running.passes() > reached + 50, "the run to go on")
         assert running.children() == before
 
 

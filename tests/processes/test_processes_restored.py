@@ -172,7 +172,7 @@ def test_knowledge_on_a_complete_log_stays_until_the_roles_have_come_and_gone(co
         assert knowledge.is_alive()
         complete.start(role)
     complete.join()
-    knowledge.join(10)
+    knowledge.join(60)
     assert not knowledge.is_alive()
     assert [event.kind for event in events(complete.path)].count("joined") == 2 * len(ROLES)
 
@@ -181,7 +181,7 @@ def test_knowledge_on_a_complete_log_to_which_nobody_comes_leaves_after_a_while(
     monkeypatch.setattr(serve, "LEFT_WITHIN", 0.5)
     begun = time.monotonic()
     knowledge.start()
-    knowledge.join(20)
+    knowledge.join(60)
     assert not knowledge.is_alive()
     assert time.monotonic() - begun >= 0.5
 
@@ -207,7 +207,7 @@ def test_the_q_table_of_an_episode_that_is_not_over_is_not_handed_out(here, mode
         def plan(self, request, knowledge):
             if request.pass_no == 5:
                 asked.append(knowledge.q_table())
-                assert go.wait(30)
+                assert go.wait(60)
             return super().plan(request, knowledge)
 
     sys.modules["own"].Asks = Asks
@@ -216,7 +216,7 @@ def test_the_q_table_of_an_episode_that_is_not_over_is_not_handed_out(here, mode
         run.start_all()
         run.until(lambda: asked, "a Q-table of what is over")
         for number in (7, 100):
-            answers = list(run.operator.get(f"{run.wire.ask('table')}?loop=0;pass={number}", timeout=8))
+            answers = list(run.operator.get(f"{run.wire.ask('table')}?loop=0;pass={number}", timeout=60))
             assert f"not at the end of {number}" in answers[0].err.payload.to_string()
         go.set()
         Paced.free.set()

@@ -33,7 +33,7 @@ class Held(PageHinkley):
 
     def _pass(self):
         if self.updates in self.gates:
-            assert self.gates[self.updates].wait(30)
+            assert self.gates[self.updates].wait(60)
 
 
 class Late(Exponential):
@@ -59,7 +59,7 @@ class Waits(Morphin):
 
     def plan(self, request, knowledge):
         if request.pass_no in self.gates:
-            assert self.gates[request.pass_no].wait(30)
+            assert self.gates[request.pass_no].wait(60)
         return super().plan(request, knowledge)
 
 
@@ -69,7 +69,7 @@ class Endless(Morphin):
     over = threading.Event()
 
     def __init__(self, *given, **parts):
-        assert self.over.wait(30)
+        assert self.over.wait(60)
         super().__init__(*given, **parts)
 
 

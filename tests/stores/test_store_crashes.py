@@ -67,7 +67,7 @@ def test_nothing_that_was_acknowledged_is_missing_after_kill_9(tmp_path):
                 printed = int(process.stdout.readline())
             process.kill()
             # What it said before it died was said after the commit, whoever read it when.
-            rest, err = process.communicate(timeout=20)
+            rest, err = process.communicate(timeout=60)
             assert process.returncode == -signal.SIGKILL, err
             # Its first line may be the end of one that was read ahead, its last one the beginning of another.
             whole = [line for line in rest.splitlines(keepends=True)[1:] if line.endswith("\n")]
@@ -85,7 +85,7 @@ def test_a_full_disk_is_said_so_and_what_was_acknowledged_before_is_kept(tmp_pat
     limit = """signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))"""
     process = start(path, 10_000, limit)
-    out, err = process.communicate(timeout=40)
+    out, err = process.communicate(timeout=60)
     *numbers, sentence = out.splitlines()
     assert process.returncode == 3, err
     assert "log.sqlite cannot be written: " in sentence
@@ -93,7 +93,7 @@ def test_a_full_disk_is_said_so_and_what_was_acknowledged_before_is_kept(tmp_pat
     count = check(path, int(numbers[-1]))
     # With room again it is gone on with.
     with start(path, count // 4 + 3) as process:
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert int(out.splitlines()[0]) == count
     with Store(path, readonly=True) as store:

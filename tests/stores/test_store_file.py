@@ -163,7 +163,7 @@ def test_a_second_writer_in_another_process_is_refused(store, path):
         except ResultsError as error:
             print(error)
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=30)
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, timeout=60)
     assert done.stdout.startswith("another Knowledge writes ")
 
 
