@@ -178,11 +178,15 @@ class Beat(Message):
 
 
 class Control(Message):
-    """A question to a role: replace a part by another (`part`, `to`), or hand out the Q-table of an episode."""
+    """A question to a role: replace a part by another (`part`, `to`), or hand out the Q-table of an episode.
+
+    One whose answer was lost is asked again under the same `asked`, and is then the same question.
+    """
 
     what: Literal["swap", "q_table"]
     part: Name | None = None
     to: dict[str, Any] | None = None
+    asked: Name | None = None
     loop: Number | None = None
     pass_no: Number | None = None
 

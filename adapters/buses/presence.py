@@ -101,7 +101,7 @@ class Presence:
             stage = STAGE_OF[role]
             beat = seen.beat
             roles[role] = RoleStatus(
-                alive=bool(seen.tokens),
+                alive=ledger.epoch(role) in seen.tokens,
                 epoch=ledger.epoch(role),
                 pid=seen.pid,
                 host=seen.host,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 import tomllib
+import uuid
 from typing import Any
 
 import zenoh
@@ -24,32 +25,59 @@ ANSWERED_WITHIN = CHECKED_WITHIN + 15.0
 THERE_WITHIN = 5.0
 """Seconds that a role has to be there: it may just be started again, or its link be about to come back."""
 
+LOOK_EVERY = 0.05
+"""Seconds between two looks whether it is."""
+
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
-    role = owner(chosen.part)
-    control = Control(what="swap", part=chosen.part, to=_spec(chosen.to)).pack()
+    control = Control(what="swap", part=chosen.part, to=_spec(chosen.to), asked=uuid.uuid4().hex)
     with operator(chosen) as (session, wire):
-        # A question that nobody hears ends at once, and one that was heard must not be asked twice.
-        deadline = time.monotonic() + THERE_WITHIN
-        while not _is_there(role, session, wire) and time.monotonic() < deadline:
-            time.sleep(0.05)  # Knowledge tells who is there when it is asked
-        said = None
-        for reply in session.get(wire.control(role), payload=control, timeout=ANSWERED_WITHIN):
-            if reply.ok is not None:
-                _print(Replaced.unpack(reply.ok.payload.to_bytes())[0], chosen.to)
-                return 0
-            said = None if reply.err is None else reply.err.payload.to_string()
-    if said is None or said == "Timeout":
-        raise BusError(
-            f"{role} did not answer on {wire.endpoint}. Is it there (`mapek status --connect {wire.endpoint}`), and "
-            "does the loop run?"
-        )
-    raise MapekError(said)
+        reply = _ask(owner(chosen.part), control, session, wire)
+    if reply.ok is None:
+        raise MapekError(_refusal(reply))
+    _print(Replaced.unpack(reply.ok.payload.to_bytes())[0], chosen.to)
+    return 0
 
 
-def _is_there(role: str, session: zenoh.Session, wire: Wire) -> bool:
-    return any(status.roles[role].alive for status in ask_status(session, wire, 1.0))
+def _ask(role: str, control: Control, session: zenoh.Session, wire: Wire) -> zenoh.Reply:
+    """Ask a role until it has answered: with a link that is lost, question and answer are too.
+
+    Only the process that may have heard the question knows it again; another one would make the swap twice.
+    """
+    deadline = time.monotonic() + ANSWERED_WITHIN
+    heard_by = None
+    while (left := deadline - time.monotonic()) > 0 and (epoch := _epoch(role, session, wire)) is not None:
+        if heard_by not in (None, epoch):
+            raise BusError(
+                f"{role} was started again while it was asked for another {control.part}; whether it has it, "
+                "`mapek log DIR --events` tells"
+            )
+        heard_by = epoch
+        for reply in session.get(wire.control(role), payload=control.pack(), timeout=left):
+            if reply.ok is not None or _refusal(reply) != "Timeout":
+                return reply
+        time.sleep(LOOK_EVERY)
+    raise BusError(
+        f"{role} did not answer on {wire.endpoint}. Is it there (`mapek status --connect {wire.endpoint}`), and "
+        "does the loop run?"
+    )
+
+
+def _epoch(role: str, session: zenoh.Session, wire: Wire) -> int | None:
+    """Wait until a role is there, and tell which of its starts it is; None where it does not come."""
+    deadline = time.monotonic() + THERE_WITHIN
+    while True:
+        for status in ask_status(session, wire, 1.0):
+            if status.roles[role].alive:
+                return status.roles[role].epoch
+        if time.monotonic() > deadline:
+            return None
+        time.sleep(LOOK_EVERY)  # Knowledge tells who is there when it is asked
+
+
+def _refusal(reply: zenoh.Reply) -> str:
+    return "" if reply.err is None else reply.err.payload.to_string()
 
 
 def _spec(text: str) -> dict[str, Any]:

@@ -56,6 +56,7 @@ class Wanted:
         self.units = 0  # loops that are to have it
         self.passes: dict[int, int] = {}  # loop -> first pass that it served
         self.handed_over = True
+        self.said: bytes | str | None = None  # the answer, or why it was refused
 
 
 class Unit:
@@ -85,6 +86,7 @@ class Replacing(ABC):
     def __init__(self) -> None:
         self._vetted: deque[tuple[Wanted, list[str]]] = deque()
         self._unanswered: list[Wanted] = []
+        self._heard: dict[str, Wanted] = {}  # by what the question is known by
 
     @abstractmethod
     def _handle(self, unit: Unit, record: Record) -> None:
@@ -129,9 +131,16 @@ class Replacing(ABC):
                 raise MalformedRecord("a swap names the part, and what it is to be")
             elif owner(control.part) != self.name:
                 raise ConfigError(f"{control.part} is a part of {owner(control.part)}, not of {self.name}")
+            elif control.asked in self._heard:
+                again = self._heard[control.asked]
+                again.asked = asked
+                if again.said is not None:
+                    self._say(again)
             else:
                 wanted = Wanted(asked, control.part, spec_of(control.to))
                 self._unanswered.append(wanted)
+                if control.asked is not None:
+                    self._heard[control.asked] = wanted
                 # Its checks take their time, in which the loop goes on.
                 threading.Thread(target=self._vet_in_time, args=(wanted,), daemon=True).start()
         except (MapekError, ValueError) as error:
@@ -179,8 +188,7 @@ class Replacing(ABC):
             sentence += f" In another loop it had served its first pass by then, and stays: loop {taken}."
         logger.warning("%s", sentence)
         self.member.note("swap refused", sentence[:2000])
-        self._unanswered.remove(wanted)
-        self.member.refuse(wanted.asked.query, sentence)
+        self._answer(wanted, sentence)
 
     def _refuse_all(self) -> None:
         """Say to all who still wait for an answer that the run is over."""
@@ -258,8 +266,18 @@ class Replacing(ABC):
         if len(wanted.passes) == wanted.units:
             passes = tuple(wanted.passes[loop] for loop in sorted(wanted.passes))
             answer = Replaced(part=wanted.part, passes=passes, handed_over=wanted.handed_over)
-            self._unanswered.remove(wanted)
-            self.member.answer(wanted.asked, answer.pack())
+            self._answer(wanted, answer.pack())
+
+    def _answer(self, wanted: Wanted, said: bytes | str) -> None:
+        wanted.said = said
+        self._unanswered.remove(wanted)
+        self._say(wanted)
+
+    def _say(self, wanted: Wanted) -> None:
+        if isinstance(wanted.said, bytes):
+            self.member.answer(wanted.asked, wanted.said)
+        else:
+            self.member.refuse(wanted.asked.query, str(wanted.said))
 
 
 def reason(error: BaseException) -> str:

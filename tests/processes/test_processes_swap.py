@@ -4,8 +4,10 @@ import json
 import os
 import re
 import signal
+import threading
 
 import pytest
+from process_chaos import LONGER_THAN_LEASE
 from real_processes import (
     EXAMPLES,
     events,
@@ -13,6 +15,7 @@ from real_processes import (
     looking_on,
     records,
     run_here,
+    started,
     store,
     swap,
     until,
@@ -26,6 +29,9 @@ from mape import load
 EPISODES = 400
 
 OWN = '''
+import time
+from pathlib import Path
+
 from mape.plan.morphin import Morphin
 
 
@@ -66,6 +72,16 @@ class OneRate(Gentle):
 
     def plan(self, request, knowledge):
         return super().plan(request, knowledge)._replace(learning_rate=(0.1,))
+
+
+class Waits(Gentle):
+    """Whose check begins, and ends when it is told to."""
+
+    def start(self, loop):
+        Path("check-began").touch()
+        while not Path("check-may-end").exists():
+            time.sleep(0.01)
+        return super().start(loop)
 '''
 
 
@@ -141,6 +157,22 @@ def test_a_swap_reaches_a_role_that_is_just_being_started_again(config, walk):
             until(lambda: (status := ask()) and not status.roles["plan"].alive, "its absence")
         code, said = swap(running, "plan", "own_parts:Gentle")
         assert code == 0, said
+        walk.over()
+        running.result()
+    assert [event.pass_no for event in events(running.log, "swapped")] == [pass_named(said)]
+
+
+def test_a_swap_whose_answer_is_lost_is_asked_for_again_and_made_once(config, walk):
+    asked = ("swap", "plan", "own_parts:Waits", "--connect")
+    with up(config) as running:
+        running.wait_for_pass(60)
+        with started(*asked, running.endpoint, cwd=config.parent, name="swap") as asking:
+            until((config.parent / "check-began").exists, "the check to begin")
+            os.kill(running.child("knowledge"), signal.SIGSTOP)
+            threading.Event().wait(LONGER_THAN_LEASE)  # who asks loses the link, and with it the answer
+            os.kill(running.child("knowledge"), signal.SIGCONT)
+            (config.parent / "check-may-end").touch()
+            said = asking.end()
         walk.over()
         running.result()
     assert [event.pass_no for event in events(running.log, "swapped")] == [pass_named(said)]
