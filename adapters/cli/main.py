@@ -30,6 +30,9 @@ class OutputError(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
+    # Before NumPy is imported: a matrix product on several threads ends in other last bits on other numbers of cores.
+    # Trials and roles are processes, and have the cores without it.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     top = parser()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import gymnasium
 import pytest
-from real_runs import contents, result_of
+from real_runs import contents, result_of, run
 
 from adapters.cli.main import main
 
@@ -166,3 +166,26 @@ def test_modules_of_all_agents_of_swaps_and_of_the_system_are_kept(here: Path) -
         "own_plan": sha256(plan),
         "own_worlds": sha256(register),
     }
+
+
+PRODUCT = """
+import numpy as np
+
+VALUES = np.random.default_rng(0).standard_normal(200_001)
+
+class Product(PageHinkley):
+    def update(self, x):
+        return super().update(x * float(VALUES @ VALUES))
+"""
+
+
+def test_a_part_that_multiplies_large_arrays_gives_the_same_bits_whatever_the_number_of_cores(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "own_detector.py").write_text(DETECTOR + PRODUCT)
+    product = ("--set", 'monitor.detectors=["own_detector:Product"]')
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)  # by default one for each core
+    run(*RUN, *product, "--out", "default", cwd=here)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    run(*RUN, *product, "--out", "one", cwd=here)
+    assert result_of(here / "default")["log_sha256"] == result_of(here / "one")["log_sha256"]
