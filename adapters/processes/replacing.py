@@ -20,9 +20,10 @@ from adapters.buses.messages import Replaced, Swapped
 from adapters.processes.remote import RemoteKnowledge
 from adapters.roles import STAGE_OF
 from adapters.stores.ledger import Fit, layout_from
-from knowledge import MalformedRecord, Record, from_json, to_json
+from knowledge import ChangePlan, MalformedRecord, Observation, Record, from_json, to_json
 from mape.config import Config
 from mape.errors import BusError, ConfigError, MapekError, PartError
+from mape.execute.adoption import check_actions, fitting
 from mape.parts import owner, with_part
 from mape.specs import PartSpec
 from mape.states import told
@@ -216,12 +217,12 @@ class Replacing(ABC):
         self._took(unit, wanted, record.pass_no, handed_over)
 
     def _check(self, unit: Unit, given: Record) -> None:
-        """Look at what a new part has made of a record as Knowledge will, for which it is too late once it is sent.
+        """Look at what a new part has made of a record as others will, for which it is too late once it is sent.
 
         Raises
         ------
         PartError
-            It cannot be written, does not fit the run, or does not hand on what it was given.
+            It cannot be written, does not fit the run, does not hand on what it was given, or cannot be executed.
         """
         layout = self.member.joined.layout
         assert layout is not None
@@ -236,6 +237,16 @@ class Replacing(ABC):
                     raise PartError(
                         f"its {type(made).__name__} says {name} = {says}, and was given {was}; a part hands that on"
                     )
+            if isinstance(made, ChangePlan):
+                self._check_plan(unit, made)
+
+    def _check_plan(self, unit: Unit, plan: ChangePlan) -> None:
+        assert unit.knowledge is not None
+        seen = unit.knowledge.log.find(Observation, plan.pass_no)
+        assert isinstance(seen, Observation)
+        if unit.config.execute.mode == "free":
+            plan = fitting(plan, seen.known)
+        check_actions(plan, seen.known, seen.available, unit.knowledge)
 
     def _undo(self, unit: Unit) -> Callable[[], None]:
         """Return what puts the parts back that a component has now."""

@@ -44,6 +44,30 @@ def checked_rate(plan: ChangePlan, learner: Learner) -> npt.NDArray[np.float64]:
     return rates
 
 
+def check_actions(plan: ChangePlan, known: tuple[int, ...], available: tuple[int, ...], knowledge: Knowledge) -> None:
+    """Look at a plan where it is made, as far as the actions tell whether Execute can put it in force.
+
+    Which actions the system holds in reserve, to enable, the system alone knows.
+
+    Parameters
+    ----------
+    plan
+        What is planned.
+    known, available
+        Actions with a row in the Q-table, and those that the system offers, as of the observation before the plan.
+    knowledge
+        Where the table is remembered that the plan may adopt.
+
+    Raises
+    ------
+    PartError
+        An action cannot be dropped, the table is not remembered, or no action would be left.
+    """
+    after = _rows_after(plan, QTable(known, 1), knowledge)
+    if not set(after.actions) & {*available, *plan.enable}:
+        raise _none_left(plan, after, "the system", available)
+
+
 def table_after(
     plan: ChangePlan, table: QTable, available: tuple[int, ...], system: ManagedSystem, knowledge: Knowledge
 ) -> QTable:
@@ -54,12 +78,7 @@ def table_after(
     PartError
         An action cannot be dropped, the table is not remembered or does not fit, or no action would be left.
     """
-    try:
-        after = table.copy() if plan.adopt is None else knowledge.recall(plan.adopt)
-        after.add(plan.add)
-        after.drop(plan.drop)
-    except (LookupError, ValueError) as error:
-        raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
+    after = _rows_after(plan, table, knowledge)
     if after.n_states != system.n_states:
         raise PartError(
             f"plan {plan.pass_no} adopts a Q-table of {after.n_states} states; {system.name} has {system.n_states}"
@@ -67,11 +86,25 @@ def table_after(
     # Where only a reset tells what is offered, an enabled action comes with the next one: too late for these rows.
     told = system.available(plan.pass_no + 1) is not None
     if not set(after.actions) & {*available, *(plan.enable if told else ())}:
-        raise PartError(
-            f"plan {plan.pass_no} leaves a Q-table of the actions {after.actions}; {system.name} offers "
-            f"{available}, of which at least one must stay"
-        )
+        raise _none_left(plan, after, system.name, available)
     return after
+
+
+def _rows_after(plan: ChangePlan, table: QTable, knowledge: Knowledge) -> QTable:
+    try:
+        after = table.copy() if plan.adopt is None else knowledge.recall(plan.adopt)
+        after.add(plan.add)
+        after.drop(plan.drop)
+    except (LookupError, ValueError) as error:
+        raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
+    return after
+
+
+def _none_left(plan: ChangePlan, after: QTable, system: str, available: tuple[int, ...]) -> PartError:
+    return PartError(
+        f"plan {plan.pass_no} leaves a Q-table of the actions {after.actions}; {system} offers {available}, of which "
+        "at least one must stay"
+    )
 
 
 def enable(plan: ChangePlan, system: ManagedSystem) -> None:

@@ -54,6 +54,26 @@ class Elsewhere(Morphin):
         return plan._replace(loop=7) if serves("plan") else plan
 
 
+class DropsUnknown(Morphin):
+    """Drops an action that has no row."""
+
+    def plan(self, request, knowledge):
+        plan = super().plan(request, knowledge)
+        return plan._replace(drop=(9,)) if serves("plan") else plan
+
+
+class DropsAll(Morphin):
+    def plan(self, request, knowledge):
+        plan = super().plan(request, knowledge)
+        return plan._replace(drop=knowledge.actions) if serves("plan") else plan
+
+
+class AdoptsUnknown(Morphin):
+    def plan(self, request, knowledge):
+        plan = super().plan(request, knowledge)
+        return plan._replace(adopt="0" * 64) if serves("plan") else plan
+
+
 class Invents(Changes):
     """Hands on signals that the pass did not have."""
 
@@ -136,7 +156,7 @@ class Carries(gymnasium.Env):
 
 gymnasium.register("Carries-v0", Carries, max_episode_steps=6)
 
-OWN = [Smooth, Adds, Ahead, Elsewhere, Invents, Unheard, Turns, Quits, Stumbles]
+OWN = [Smooth, Adds, Ahead, Elsewhere, DropsUnknown, DropsAll, AdoptsUnknown, Invents, Unheard, Turns, Quits, Stumbles]
 
 
 @pytest.fixture(autouse=True)
@@ -153,6 +173,9 @@ REFUSED = [
     ("plan", "Adds", "action id 100 is outside 0 .. 63"),
     ("plan", "Ahead", "says pass_no = "),
     ("plan", "Elsewhere", "says loop = 7, and was given 0"),
+    ("plan", "DropsUnknown", "cannot be executed: actions [9] have no row"),
+    ("plan", "DropsAll", "leaves a Q-table of the actions ()"),
+    ("plan", "AdoptsUnknown", "cannot be executed: "),
     ("analyze", "Invents", "says signals = "),
     ("analyze", "Unheard", "'noise'"),
     ("plan", "Quits", "ZeroDivisionError: it is unlike all others"),
