@@ -180,13 +180,13 @@ class Beat(Message):
 class Control(Message):
     """A question to a role: replace a part by another (`part`, `to`), or hand out the Q-table of an episode.
 
-    One whose answer was lost is asked again under the same `asked`, and is then the same question.
+    One whose answer was lost is asked again with the same `question`, any text of its own, and is not answered anew.
     """
 
     what: Literal["swap", "q_table"]
     part: Name | None = None
     to: dict[str, Any] | None = None
-    asked: Name | None = None
+    question: Name | None = None
     loop: Number | None = None
     pass_no: Number | None = None
 

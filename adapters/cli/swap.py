@@ -31,7 +31,7 @@ LOOK_EVERY = 0.05
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
-    control = Control(what="swap", part=chosen.part, to=_spec(chosen.to), asked=uuid.uuid4().hex)
+    control = Control(what="swap", part=chosen.part, to=_spec(chosen.to), question=uuid.uuid4().hex)
     with operator(chosen) as (session, wire):
         reply = _ask(owner(chosen.part), control, session, wire)
     if reply.ok is None:
@@ -57,7 +57,7 @@ def _ask(role: str, control: Control, session: zenoh.Session, wire: Wire) -> zen
         for reply in session.get(wire.control(role), payload=control.pack(), timeout=left):
             if reply.ok is not None or _refusal(reply) != "Timeout":
                 return reply
-        time.sleep(LOOK_EVERY)
+        time.sleep(LOOK_EVERY)  # a role that has just died counts as there for a moment
     raise BusError(
         f"{role} did not answer on {wire.endpoint}. Is it there (`mapek status --connect {wire.endpoint}`), and "
         "does the loop run?"

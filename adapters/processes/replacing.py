@@ -87,7 +87,7 @@ class Replacing(ABC):
     def __init__(self) -> None:
         self._vetted: deque[tuple[Wanted, list[str]]] = deque()
         self._unanswered: list[Wanted] = []
-        self._heard: dict[str, Wanted] = {}  # by what the question is known by
+        self._heard: dict[str, Wanted] = {}  # by `Control.question`
 
     @abstractmethod
     def _handle(self, unit: Unit, record: Record) -> None:
@@ -132,16 +132,16 @@ class Replacing(ABC):
                 raise MalformedRecord("a swap names the part, and what it is to be")
             elif owner(control.part) != self.name:
                 raise ConfigError(f"{control.part} is a part of {owner(control.part)}, not of {self.name}")
-            elif control.asked in self._heard:
-                again = self._heard[control.asked]
+            elif control.question in self._heard:
+                again = self._heard[control.question]
                 again.asked = asked
                 if again.said is not None:
-                    self._say(again)
+                    self._say(again, again.said)
             else:
                 wanted = Wanted(asked, control.part, spec_of(control.to))
                 self._unanswered.append(wanted)
-                if control.asked is not None:
-                    self._heard[control.asked] = wanted
+                if control.question is not None:
+                    self._heard[control.question] = wanted
                 # Its checks take their time, in which the loop goes on.
                 threading.Thread(target=self._vet_in_time, args=(wanted,), daemon=True).start()
         except (MapekError, ValueError) as error:
@@ -282,13 +282,13 @@ class Replacing(ABC):
     def _answer(self, wanted: Wanted, said: bytes | str) -> None:
         wanted.said = said
         self._unanswered.remove(wanted)
-        self._say(wanted)
+        self._say(wanted, said)
 
-    def _say(self, wanted: Wanted) -> None:
-        if isinstance(wanted.said, bytes):
-            self.member.answer(wanted.asked, wanted.said)
+    def _say(self, wanted: Wanted, said: bytes | str) -> None:
+        if isinstance(said, bytes):
+            self.member.answer(wanted.asked, said)
         else:
-            self.member.refuse(wanted.asked.query, str(wanted.said))
+            self.member.refuse(wanted.asked.query, said)
 
 
 def reason(error: BaseException) -> str:

@@ -243,8 +243,9 @@ class Supervisor:
         now = time.monotonic()
         child.deaths.append((now, self._passes))
         if code >= 0:
-            before, child.failed = child.failed, (now, self._passes)
-            if before is not None and (again := self._again(child, *before)):
+            again = self._again(child, now)
+            child.failed = (now, self._passes)
+            if again:
                 raise Failed(f"{child.role} failed twice {again}: {self._failure(child, code)}")
         if len(child.deaths) == CRASHES and child.deaths[0][1] == self._passes:
             raise Failed(
@@ -260,12 +261,14 @@ class Supervisor:
         status = self.status
         return status is not None and status.roles[child.role].last_pass >= status.episodes
 
-    def _again(self, child: Child, failed_at: float, passes: int) -> str:
-        """Say in how far an error is the last one again; empty if it is another."""
+    def _again(self, child: Child, now: float) -> str:
+        """Say in how far an error that came now is the last one again; empty where it is another, or the first."""
+        if child.failed is None:
+            return ""
+        failed_at, passes = child.failed
         if passes == self._passes:
             return "at the same place"
-        assert child.failed is not None
-        apart = child.failed[0] - failed_at
+        apart = now - failed_at
         return f"within {apart:.0f} s" if child.role == KNOWLEDGE and apart < KEEPS_FAILING else ""
 
     @staticmethod
@@ -336,8 +339,7 @@ class Supervisor:
         self.status = ours[0]
         self._status_of = now
         self._heard_at = self._now()
-        if self.status.passes > self._passes:
-            self._passes = self.status.passes
+        self._passes = max(self._passes, self.status.passes)
 
     def _tell_unreached(self, now: float) -> None:
         started = self.children[KNOWLEDGE].started_at

@@ -103,7 +103,7 @@ def _reaches_beyond(plain: Any, rule: QuietRule, told: Any) -> bool:
     except IndexError:
         return True
     except Exception:
-        return False  # on signals that are not the run's
+        return False  # the user's rule, on signals that are not the run's: what it raises on its own, the run tells
     return False
 
 

@@ -10,16 +10,18 @@ from queue import SimpleQueue
 from types import SimpleNamespace
 
 import pytest
-from bus_peers import Site, join_of
+from bus_peers import Site, ask, join_of
+from bus_records import run_of
 from real_processes import EXAMPLES, events, until, up, write_config
 from roles_on_threads import Roles, paced
 
 from adapters.buses import Wire, presence
 from adapters.buses.messages import Beat, Joined
-from adapters.buses.wire import ORDERED
+from adapters.buses.wire import ORDERED, role_of
 from adapters.processes import supervise
 from adapters.processes.supervise import Failed, Supervisor, ask_status
 from adapters.roles import ROLES
+from knowledge import to_json
 from mape.plan.morphin import Morphin
 
 pytestmark = pytest.mark.timeout(60)
@@ -97,6 +99,12 @@ class Watched:
             beat = Beat(epoch=self._epochs[role], pid=pid, passes=0, refused=self._beats, waiting=True)
             self.raw.put(self.wire.beat(role), beat.pack(), **ORDERED)
             until(lambda: self._heard(role), "a heartbeat", every=0.001)
+
+    def make_a_pass(self):
+        for record in run_of(1):
+            role = role_of(type(record))
+            key = self.wire.append(role, 0)
+            ask(self.raw, key, to_json(record), str(self._epochs[role]).encode())
 
     def _heard(self, role):
         return [status.roles[role].refused for status in ask_status(self.raw, self.wire, 20)] == [self._beats]
@@ -256,6 +264,49 @@ def test_who_joins_while_the_supervisor_is_stopped_is_not_taken_for_one_that_nev
     with pytest.raises(Enough):
         watched.watch(stop_and_go_on)
     assert (watched.restarts, watched.told) == ({}, [])
+
+
+DIES = """
+import pathlib, time
+while not pathlib.Path("die").exists():
+    time.sleep(0.001)
+pathlib.Path("die").unlink()
+raise SystemExit("mapek: log.sqlite cannot be written")
+"""
+
+
+SOON = (supervise.KEEPS_FAILING / 2, Failed, "knowledge failed twice within 30 s: log.sqlite cannot be written")
+LATE = (supervise.KEEPS_FAILING * 2, Enough, None)
+
+
+@pytest.mark.parametrize(("apart", "ends", "says"), [SOON, LATE], ids=["soon", "late"])
+def test_a_knowledge_that_fails_again_ends_the_run_if_that_is_soon_however_many_passes_lie_between(
+    here, monkeypatch, apart, ends, says
+):
+    monkeypatch.chdir(here)
+    watched = Watched(here, monkeypatch, hang_after=1000.0)
+    watched.supervisor.children["knowledge"].command[:] = [sys.executable, "-S", "-c", DIES]
+    asked_to_die = []
+
+    def die():
+        asked_to_die.append(watched.clock.now)
+        (here / "die").touch()
+
+    def failed_twice(watched):
+        status, restarts = watched.supervisor.status, watched.restarts.get("knowledge", 0)
+        if status is None:
+            return False
+        if not asked_to_die:
+            die()
+        elif restarts == 1 and not status.passes:
+            watched.make_a_pass()
+        elif restarts == 1 and len(asked_to_die) == 1:
+            watched.clock.now += apart
+            die()
+        return restarts == 2
+
+    with pytest.raises(ends, match=says):
+        watched.watch(failed_twice)
 
 
 OWN = """
