@@ -17,8 +17,6 @@ from adapters.roles import STAGE_OF
 from knowledge import QTable, to_json
 from mape.errors import BusError
 
-pytestmark = pytest.mark.timeout(60)
-
 GOOD = to_json(plan(0))
 
 
@@ -319,7 +317,7 @@ def test_the_records_since_a_pass_come_up_to_a_limit(site, raw, joined, monkeypa
 def test_whatever_system_is_there_answers_an_operator_under_its_own_name(site):
     operator = Wire(site.wire.endpoint, "*")
     with operator.join("operator", 5) as session:
-        (answer,) = session.get(operator.ask("status"), timeout=5)
+        (answer,) = session.get(operator.ask("status"), timeout=60)
         assert str(answer.ok.key_expr) == "mape/example/knowledge/status"
         assert status(session, operator).system == "example"
 

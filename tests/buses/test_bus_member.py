@@ -14,9 +14,6 @@ from adapters.buses.wire import ORDERED
 from knowledge import Observation, to_json
 from mape.errors import BusError, ConfigError
 
-pytestmark = pytest.mark.timeout(60)
-
-
 # In order, each once.
 
 

@@ -11,8 +11,6 @@ from adapters.buses.questions import Refused
 from knowledge import QTable
 from mape.errors import BusError
 
-pytestmark = pytest.mark.timeout(60)
-
 
 def a_table(value=1.0):
     table = QTable((0, 3), 2)

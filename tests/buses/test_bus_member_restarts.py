@@ -12,8 +12,6 @@ from adapters.buses.questions import Refused
 from adapters.roles import ROLES
 from knowledge import to_json
 
-pytestmark = pytest.mark.timeout(60)
-
 
 def test_nothing_is_lost_and_nothing_comes_twice_over_restarts_of_knowledge(site, impatient):
     passes, got = 60, {}

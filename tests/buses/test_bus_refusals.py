@@ -9,8 +9,6 @@ from adapters.roles import ROLES
 from knowledge import QTable
 from mape.parts import owner
 
-pytestmark = pytest.mark.timeout(60)
-
 EPISODES = 3
 PARTS = ("monitor", "monitor.0", "analyze", "plan", "plan.schedule", "learner")
 OTHER = Layout(signals=("evil",), detectors=0, rates=1, max_actions=1)

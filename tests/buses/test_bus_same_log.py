@@ -1,14 +1,11 @@
 """The four components log the same rows over a `LocalBus` and over the wire."""
 
-import pytest
 from bus_peers import eventually
 from bus_small_loop import Distributed, in_process, small_config
 
 from adapters.buses.messages import Control
 from adapters.roles import ROLES
 from knowledge import from_json
-
-pytestmark = pytest.mark.timeout(60)
 
 
 def logged(ledger, loop=0):

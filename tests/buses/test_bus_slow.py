@@ -2,15 +2,12 @@
 
 import threading
 
-import pytest
 from bus_peers import Site
 from bus_records import run_of
 
 from adapters.buses import answers, inbox
 from adapters.buses.wire import INPUT
 from knowledge import STAGES, to_json
-
-pytestmark = pytest.mark.timeout(60)
 
 
 def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 
 from mape.trials import each_completed
 
-PATIENCE = 30.0
+PATIENCE = 60.0
 
 
 @pytest.mark.parametrize("here", [False, True])

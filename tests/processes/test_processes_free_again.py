@@ -10,8 +10,6 @@ from roles_on_threads import Paced, Roles, paced
 from knowledge import from_json
 from mape.execute import Execute
 
-pytestmark = pytest.mark.timeout(90)
-
 OTHERS = ("monitor", "analyze", "plan")
 
 

@@ -24,8 +24,6 @@ from adapters.roles import ROLES
 from knowledge import to_json
 from mape.plan.morphin import Morphin
 
-pytestmark = pytest.mark.timeout(60)
-
 SLEEPS = [sys.executable, "-S", "-c", "import time; time.sleep(100)"]
 """A process that says nothing: what roles say, the test says in their name."""
 
@@ -41,6 +39,7 @@ class Clock:
         self.now = 1000.0
         self.missed = 0.0  # by the supervisor alone, which was stopped, as by Ctrl-Z
         self.stands = False
+        self.held = False  # by the test
         monkeypatch.setattr(
             supervise, "time", SimpleNamespace(monotonic=lambda: self.now + self.missed, sleep=self.sleep)
         )
@@ -48,7 +47,7 @@ class Clock:
 
     def sleep(self, seconds):
         time.sleep(0.002)  # for the threads of Zenoh, and for children that are to die
-        self.now += 0.0 if self.stands else seconds
+        self.now += 0.0 if self.stands or self.held else seconds
 
 
 class Watched:
@@ -193,7 +192,7 @@ class Awaited(Morphin):
     def __init__(self, *options, **named):
         super().__init__(*options, **named)
         if threading.current_thread().name == "plan":
-            self.heard.get(timeout=5)
+            self.heard.get(timeout=60)
 
 
 def test_a_role_that_makes_the_parts_of_many_loops_gives_signs_of_life(here, monkeypatch):
@@ -290,6 +289,7 @@ def test_a_knowledge_that_fails_again_ends_the_run_if_that_is_soon_however_many_
 
     def die():
         asked_to_die.append(watched.clock.now)
+        watched.clock.held = True  # how often the supervisor looks until a process is gone is the machine's affair
         (here / "die").touch()
 
     def failed_twice(watched):

@@ -13,8 +13,6 @@ from adapters.processes.roles import make_role
 from mape.config import from_table, merge
 from mape.errors import BusError, ConfigError, ManagedSystemError
 
-pytestmark = pytest.mark.timeout(60)
-
 
 class Plant(gymnasium.Env):
     """Writes down what is done to it."""

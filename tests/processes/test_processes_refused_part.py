@@ -19,8 +19,6 @@ from mape.execute.rules import QLearning, alpha_star
 from mape.monitor.page_hinkley import PageHinkley
 from mape.plan.morphin import Morphin
 
-pytestmark = pytest.mark.timeout(60)
-
 
 def serves(role):
     """Whether this is the thread of a role: a part that is only held against its contract is elsewhere."""

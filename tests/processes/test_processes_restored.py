@@ -20,8 +20,6 @@ from adapters.roles import ROLES
 from mape.errors import PartError
 from mape.plan.morphin import Morphin
 
-pytestmark = pytest.mark.timeout(60)
-
 
 class Smooth(Morphin):
     """Explores half way between what MORPHIN wants and the plan in force."""

@@ -13,8 +13,6 @@ from mape.monitor.page_hinkley import PageHinkley
 from mape.plan.exponential import Exponential
 from mape.plan.morphin import Morphin
 
-pytestmark = pytest.mark.timeout(60)
-
 
 class Held(PageHinkley):
     """Page-Hinkley that does not go past some of its updates, or its making, before it may."""

@@ -12,8 +12,6 @@ from roles_on_threads import Roles, paced
 from adapters.processes import replacing
 from mape.plan.morphin import Morphin
 
-pytestmark = pytest.mark.timeout(60)
-
 
 class Exits(Morphin):
     def plan(self, request, knowledge):

@@ -14,8 +14,6 @@ from knowledge.store import TABLES
 from mape.errors import PartError
 from mape.plan.morphin import Morphin
 
-pytestmark = pytest.mark.timeout(120)
-
 
 class Digs(Morphin):
     """Plans by which of the records can still be read."""

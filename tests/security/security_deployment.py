@@ -14,7 +14,7 @@ from adapters.buses import security
 from adapters.buses.signing import Authority, Pem
 from adapters.buses.wire import never_freed
 
-PATIENCE = 5.0
+PATIENCE = 60.0
 STATUS = "mape/s/knowledge/status"
 
 # Within one session Zenoh delivers by itself, without a router and its list.
@@ -124,7 +124,7 @@ class Deployment:
             query.reply("/".join("s" if part == "*" else part for part in str(query.key_expr).split("/")), "knowledge")
 
     def join(self, role, link=None, **how):
-        session = connect(self.port, link or security.tls(self.keys, role), timeout_ms=5_000, **how)
+        session = connect(self.port, link or security.tls(self.keys, role), timeout_ms=60_000, **how)
         return self._opened.enter_context(session)
 
     def close(self):

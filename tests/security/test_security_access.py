@@ -236,7 +236,7 @@ def test_nobody_can_answer_in_another_roles_stead(everybody, key):
 
 
 def alive(session):
-    return {str(found.ok.key_expr) for found in session.liveliness().get("mape/*/alive/**", timeout=5)}
+    return {str(found.ok.key_expr) for found in session.liveliness().get("mape/*/alive/**", timeout=60)}
 
 
 def test_a_role_is_seen_under_its_own_name_only_and_by_everybody(deployment):

@@ -9,13 +9,10 @@ import textwrap
 from contextlib import closing
 from pathlib import Path
 
-import pytest
 from bus_records import new_ledger, new_log, run_of
 
 from adapters.stores import Store
 from knowledge import ChangePlan, from_json
-
-pytestmark = pytest.mark.timeout(60)
 
 HERE = Path(__file__).parents[1] / "buses"
 
