@@ -97,8 +97,9 @@ class Log:
     def on_rows(self, listener: Callable[[npt.NDArray[np.void]], object]) -> None:
         """Hand each segment of rows that are finished from now on to `listener`.
 
-        It gets a structured array that is valid during the call. What it raises comes out of the `append` that begins
-        the next pass, of `room`, or of `flush`; then the record was not taken, and the segment is offered again.
+        It gets a structured array of its own, read-only, which may be kept. What it raises comes out of the `append`
+        that begins the next pass, of `room`, or of `flush`; then the record was not taken, and the segment is offered
+        again.
         """
         self._listeners.append(_Listener(listener, self._gone + self._filled))
 
@@ -215,7 +216,7 @@ class Log:
 
     @property
     def window(self) -> deque[Pass]:
-        """The newest finished passes, oldest first."""
+        """The newest finished passes, oldest first; it moves on with the log, ``list(log.window)`` stays."""
         while self._unread:
             self._window.extend(self._unread.popleft())
         self._unread_passes = 0
@@ -351,17 +352,16 @@ class Log:
         return digest.hexdigest()
 
     def _flush(self) -> None:
-        rows = memoryview(self._buffer)[: self._filled]
+        # A copy, as the buffer is filled anew: listeners may keep what they hear.
+        rows = bytes(memoryview(self._buffer)[: self._filled])
         end = self._gone + self._filled
         for listener in self._listeners:
             if listener.told < end:
-                segment = np.frombuffer(rows[listener.told - self._gone :], self.layout.dtype)
-                segment.flags.writeable = False
-                listener.hear(segment)
+                listener.hear(np.frombuffer(rows, self.layout.dtype)[(listener.told - self._gone) // self._row_size :])
                 listener.told = end
         digest = self._hash.copy()
         digest.update(rows)
-        newest = bytes(rows[-self._row_size :])
+        newest = rows[-self._row_size :]
         # At once, with no call between them: after a Ctrl-C the rows are all hashed, or all in the buffer.
         self._hash, self._flushed_row, self._gone, self._filled = digest, newest, end, 0
 

@@ -128,6 +128,26 @@ def config_at(config: Config, pass_no: int) -> Config:
     return config
 
 
+def cautions(config: Config) -> list[str]:
+    """Return what its detectors say, in sentences, of the signals that they are to watch; those of swaps among them.
+
+    A detector may have a method ``caution(signal)``, which returns such a sentence or None.
+
+    Raises
+    ------
+    ConfigError
+        A detector cannot be made.
+    """
+    said: list[str] = []
+    stages = [config, *(config_at(config, swap.pass_no) for swap in config.swap)]
+    watching = {spec.model_dump_json(): spec for at in stages for spec in at.monitor.detectors}
+    for spec in watching.values():
+        caution = getattr(make("detector", spec), "caution", None)
+        if caution is not None and (sentence := caution(spec.signal)) is not None:
+            said.append(f"detector {spec.name!r} on signal {spec.signal!r}: {sentence}")
+    return said
+
+
 def make(kind: str, spec: Any) -> Any:
     """Make a part of its spec, a planner with its schedule.
 

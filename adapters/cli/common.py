@@ -10,7 +10,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from adapters.results.files import cannot_write, try_whole, write_json
 from adapters.results.folder import default_path
 from mape.config import Config, load
 from mape.errors import ConfigError, ResultsError
+from mape.parts import cautions
 from mape.tables import parse_override
 
 
@@ -67,6 +68,7 @@ def open_folder(
     check_json_target(chosen)
     if chosen.out and os.path.exists(chosen.out) and not os.path.isdir(chosen.out):
         raise ConfigError(f"--out {chosen.out!r} is a file; name a folder, which may be new")
+    caution(configs.values())
     for agent, config in configs.items():
         check_name(agent)
         checked = check(config)
@@ -77,6 +79,12 @@ def open_folder(
     if folder.resumed:
         say(chosen, f"continuing in {folder.path}: {folder.resumed:,} trials are finished already")
     return folder
+
+
+def caution(configs: Iterable[Config]) -> None:
+    """Say on standard error, once, what detectors say of the signals that they are to watch."""
+    for sentence in dict.fromkeys(sentence for config in configs for sentence in cautions(config)):
+        print(f"caution: {sentence}", file=sys.stderr)
 
 
 def _looked_at(chosen: argparse.Namespace, trace: tuple[int, int] | None) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from adapters.cli.common import config_of, prepare
+from adapters.cli.common import caution, config_of, prepare
 from adapters.cli.sentences import sentence
 from adapters.systems import make_system
 from knowledge import ChangePlan, Observation
@@ -22,6 +22,7 @@ def execute(chosen: argparse.Namespace) -> int:
     config = config_of(chosen.config, chosen, chosen.agent)
     if chosen.first > config.episodes:
         raise ConfigError(f"--from {chosen.first} goes beyond the run's {config.episodes} episodes")
+    caution([config])
     loop = Loop(config, make_system(config.system))
     loop.on_swap(lambda swap, handed_over: print(swap_sentence(swap, handed_over)))
     try:

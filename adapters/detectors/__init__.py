@@ -14,7 +14,11 @@ def register() -> None:
     """
     home = "adapters.detectors.river_detector"
     registry.register(
-        "detector", "river", f"{home}:RiverDetector", "any drift detector of River by name; needs the package river"
+        "detector",
+        "river",
+        f"{home}:RiverDetector",
+        "any drift detector of River by name; DDM, EDDM, HDDMA, HDDMW take 1 as an error (invert = true for a return "
+        "of 0 and 1); needs the package river",
     )
     registry.register(
         "detector", "adwin", f"{home}:Adwin", "River's ADWIN: adaptive window, both sides; needs the package river"

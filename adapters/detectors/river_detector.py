@@ -5,6 +5,11 @@ them to a fresh detector again. That is exact as long as all of them are kept; t
 values have come without a reset, the older half is dropped and a fresh detector is fed the newer half. From then on
 the test knows that half only, in the running process just as in a restored one. It forgets, and it forgets the same
 everywhere; with `memory` above the length of a run it forgets nothing.
+
+Tests of an error rate (`ERROR_RATE`) were made for a classifier's mistakes, 1 for an error, and alarm when errors
+become more frequent. A return of 0 and 1 is the other way round, 1 for success: with ``invert = true`` the test sees
+``1 - x``, and alarms when success becomes rarer. FHDDM is the exception: River's text says that it takes 1 as an error
+too, but its code alarms when ones become rarer, so it watches a return as it is. Each side is held by a test.
 """
 
 from __future__ import annotations
@@ -23,6 +28,14 @@ from mape.specs import PartConfig
 
 STATISTICS = {"ADWIN": "estimation", "KSWIN": "p_value"}
 """Public attributes of River's that say what the test sees now; its other detectors expose none."""
+
+ERROR_RATE = ("DDM", "EDDM", "HDDMA", "HDDMW")
+"""Detectors of River that take 1 as an error, and alarm when ones become more frequent."""
+
+SUCCESS_RATE = ("FHDDM",)
+"""Those that alarm when ones become rarer."""
+
+_MIRRORED: dict[Direction, Direction] = {"down": "up", "up": "down", "unknown": "unknown"}
 
 
 @functools.cache
@@ -69,6 +82,7 @@ class RiverConfig(PartConfig):
     detector: str = Field("ADWIN", min_length=1, description="name of the class in river.drift or river.drift.binary")
     options: dict[str, Any] = Field(default_factory=dict, description="its parameters, under River's names")
     memory: int = Field(10_000, ge=2, description="values kept since the last reset, 8 bytes each; see the module")
+    invert: bool = Field(False, description="let the test see 1 - x, for tests that take 1 as an error")
 
     @field_validator("detector")
     @classmethod
@@ -96,8 +110,9 @@ class RiverConfig(PartConfig):
 class RiverDetector:
     """A drift detector of River.
 
-    It is two-sided, `direction` ``"unknown"``, but for a PageHinkley whose `mode` says which side it watches. Where a
-    detector takes a `seed` and none is given, it is 0: two runs must agree.
+    Its `direction` is ``"unknown"``, but for a PageHinkley whose `mode` says which side it watches, and for a test of
+    an error rate that `invert` turns to the other side. Where a detector takes a `seed` and none is given, it is 0: two
+    runs must agree.
 
     Examples
     --------
@@ -105,15 +120,19 @@ class RiverDetector:
     >>> alarms = [test.update(x) for x in [0.0] * 100 + [5.0] * 100]
     >>> alarms.index(True), test.direction
     (127, 'unknown')
+    >>> test = RiverDetector(RiverConfig(detector="DDM", invert=True))
+    >>> alarms = [test.update(x) for x in [1.0] * 100 + [0.0] * 100]
+    >>> any(alarms), test.direction
+    (True, 'down')
     """
 
     Config: type[PartConfig] = RiverConfig
 
     def __init__(self, config: RiverConfig) -> None:
         self.config: PartConfig = config
-        self._set_up(config.detector, dict(config.options), config.memory)
+        self._set_up(config.detector, dict(config.options), config.memory, invert=config.invert)
 
-    def _set_up(self, name: str, options: dict[str, Any], memory: int) -> None:
+    def _set_up(self, name: str, options: dict[str, Any], memory: int, *, invert: bool = False) -> None:
         self._class = river_class(name)
         if "seed" in inspect.signature(self._class).parameters:
             options.setdefault("seed", 0)
@@ -121,10 +140,28 @@ class RiverDetector:
         self._memory = memory
         self._statistic = STATISTICS.get(name)
         self._binary = self._class.__module__.startswith("river.drift.binary")
-        self.direction: Direction = "unknown"
+        self._invert = invert
+        # The side of the values that the test sees; a two-sided one has none.
+        side: Direction = "unknown"
         if name == "PageHinkley" and options.get("mode") in ("down", "up"):
-            self.direction = options["mode"]
+            side = options["mode"]
+        elif self._binary and not options.get("two_sided_test"):
+            side = "up" if name in ERROR_RATE else "down" if name in SUCCESS_RATE else "unknown"
+        self._side = _MIRRORED[side] if invert else side
+        # Of a test for 0 and 1 that is not inverted it has always been "unknown", and stands so in the hashes of logs.
+        self.direction: Direction = self._side if invert or not self._binary else "unknown"
         self.reset()
+
+    def caution(self, signal: str) -> str | None:
+        """Say what is odd where this test watches `signal`; None where nothing is."""
+        if signal != "return" or not self._binary or self._side != "up":
+            return None
+        set_to, other = ("true", "false") if self._invert else ("false", "true")
+        return (
+            f"River's {self._class.__name__} with invert = {set_to} alarms when ones become more frequent, as a rate "
+            f"of errors does: of a return it sees the rise, and never the fall. Give it invert = {other}, or a signal "
+            "on which 1 is an error."
+        )
 
     @property
     def statistic(self) -> float | None:
@@ -132,7 +169,7 @@ class RiverDetector:
         return None if self._statistic is None else float(getattr(self._test, self._statistic))
 
     def update(self, x: float) -> bool:
-        """Take one value; say whether the test alarms.
+        """Take one value, as ``1 - x`` where `invert` is set; say whether the test alarms.
 
         Raises
         ------
@@ -141,6 +178,8 @@ class RiverDetector:
         """
         if self._binary and x not in (0.0, 1.0):
             raise ValueError(f"River's {self._class.__name__} watches a signal of 0 and 1, got {x}")
+        if self._invert:
+            x = 1.0 - x
         self._signal.append(x)
         if len(self._signal) > self._memory:
             self._replay(self._signal[-(self._memory // 2) :])
@@ -153,7 +192,7 @@ class RiverDetector:
         self._replay([])
 
     def state(self) -> dict[str, list[float]]:
-        """Return the values since the last reset, as many as are kept."""
+        """Return the values that the test saw since the last reset, as many as are kept."""
         return {"signal": list(self._signal)}
 
     def restore(self, state: Any) -> None:

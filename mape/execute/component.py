@@ -351,7 +351,7 @@ class Execute:
     def _begin(self, number: int, at: int) -> tuple[int, ...]:
         seed, *key = self._seeds
         sequence = np.random.SeedSequence(entropy=seed, spawn_key=(*key, number))
-        block = self.uniforms.values[at : at + self._system_draws]
+        block = self.uniforms.values[at : at + self._system_draws].copy()  # a system may keep what it is told
         told = Episode(number, int(sequence.generate_state(1)[0]), block)
         try:
             self._called.state, available = self.system.begin(told)

@@ -1,11 +1,15 @@
-"""Tasks on an executor, and with who asks for their results as one more worker."""
+"""Tasks on an executor, with who asks for results as one more worker; and what a trial's listeners may keep."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
+from mape_runs import GRID, Corridor, config, corridor_loop
 
-from mape.trials import each_completed
+from adapters.systems import make_system
+from mape.execute.uniforms import Uniforms
+from mape.trials import each_completed, run_trial
 
 PATIENCE = 60.0
 
@@ -50,3 +54,37 @@ def test_no_task_is_begun_after_one_has_failed_here():
             list(each_completed(executor, work, [(k,) for k in range(9)], in_flight=2, here=True))
         released.set()
     assert sorted(begun) == [0, 1]
+
+
+@pytest.mark.parametrize("engine", ["auto", "python"])
+def test_rows_that_a_listener_keeps_stay_as_they_were(engine):
+    kept, copied = [], []
+    run_trial(
+        config(GRID, episodes=1200, execute={"engine": engine}),
+        0,
+        make_system,
+        on_rows=kept.append,
+        prepare=lambda loop: loop.log.on_rows(lambda rows: copied.append(rows.copy())),
+    )
+    assert np.concatenate(kept)["pass"].tolist() == list(range(1, 1201))
+    assert np.concatenate(kept).tobytes() == np.concatenate(copied).tobytes()
+
+
+def test_the_uniforms_that_a_system_keeps_stay_as_they_were():
+    system = Corridor()
+    system.draws = (2, 1)
+    loop = corridor_loop(system)
+    loop.run(1100)
+    stream = Uniforms(0, (0, 0), loop.execute.uniforms.width)
+    for episode in system.begun:
+        at = stream.find(episode.number - 1)
+        assert episode.uniforms.tolist() == stream.values[at : at + 2 + system.max_steps].tolist()
+
+
+def test_traced_steps_that_a_listener_keeps_stay_as_they_were():
+    kept, copied = [], []
+    loop = corridor_loop()
+    loop.execute.record_trace(1, 30, lambda number, steps: (kept.append(steps), copied.append(steps.copy())))
+    loop.run(40)
+    assert [steps.tolist() for steps in kept] == [steps.tolist() for steps in copied]
+    assert len(kept) == 30
