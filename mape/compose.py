@@ -33,6 +33,7 @@ import numpy as np
 
 from mape.ctrl_c import CtrlC
 from mape.errors import ConfigError
+from mape.ownership import not_ones_own
 
 Rule = Callable[..., Any]
 Bindings = Mapping[str, "Rule | Composed"]
@@ -234,12 +235,13 @@ def _names(code: CodeType) -> set[str]:
 def cache_folder() -> Path:
     """Return the folder of compiled code: ``$MAPEK_CACHE``, or ``mapek`` in the user's cache folder.
 
-    Where neither can be written, a folder in the system's temporary one that belongs to the user alone.
+    Where neither can be written, a folder in the system's temporary one. What is in it will be run, so it is the user's
+    own, and nobody else can write there.
 
     Raises
     ------
     ConfigError
-        None of them can be used.
+        ``$MAPEK_CACHE`` is somebody else's, or one in which others can write; or none of them can be used.
     """
     named = os.environ.get("MAPEK_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
@@ -247,9 +249,15 @@ def cache_folder() -> Path:
     for folder in (Path(named) if named else Path(base, "mapek"), fallback):
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            about = folder.lstat()
-            # Anybody may have made the one with a name that can be guessed, to put code there that we would run.
-            if folder == fallback and (about.st_uid != os.getuid() or about.st_mode & 0o077):
+            # Anybody may have made the one with a name that can be guessed.
+            if folder == fallback and (folder.is_symlink() or not_ones_own(folder, 0o700)):
+                continue
+            if foreign := not_ones_own(folder):
+                if named:
+                    raise ConfigError(
+                        f"MAPEK_CACHE is {named!r}, and {foreign}; the code in it would be run as yours. Name a folder "
+                        "of your own, or one that is new"
+                    )
                 continue
             with tempfile.TemporaryFile(dir=folder):
                 return folder
@@ -267,7 +275,7 @@ def _load(text: str, key: str, name: str, rules: tuple[Rule, ...]) -> Any:
         # a call that is left standing counts references to every array, ten times the cost of a step.
         register_jitable(forceinline=True)(rule)
     folder = cache_folder() / key
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(mode=0o700, exist_ok=True)
     path = folder / "composed.py"
     if not path.exists():
         with tempfile.NamedTemporaryFile("w", dir=folder, suffix=".tmp", delete=False, encoding="utf-8") as file:

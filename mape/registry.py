@@ -7,6 +7,7 @@ import inspect
 import json
 import os
 import sys
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -51,14 +52,21 @@ PARTS: dict[str, dict[str, Entry]] = {
     },
 }
 
-MEMBERS: dict[str, tuple[str, ...]] = {
-    "detector": ("direction", "statistic", "update", "reset"),
+METHODS: dict[str, tuple[str, ...]] = {
+    "detector": ("update", "reset"),
     "analyzer": ("analyze",),
     "planner": ("start", "plan"),
-    "schedule": ("epsilon", "advance", "reset"),
-    "learner": ("rate_names", "discount", "bootstrap_terminal", "value", "step_size"),
+    "schedule": ("advance", "reset"),
+    "learner": ("value", "step_size"),
 }
-"""What the loop calls of a part; without it there is no run. `mapek check` asks for more."""
+"""What the loop calls of a part, and its class therefore has; a class without is never called."""
+
+VALUES: dict[str, tuple[str, ...]] = {
+    "detector": ("direction", "statistic"),
+    "schedule": ("epsilon",),
+    "learner": ("rate_names", "discount", "bootstrap_terminal"),
+}
+"""What the loop reads of a part besides, once it is made. `mapek check` asks for more."""
 
 
 def register(kind: str, name: str, target: str, summary: str) -> None:
@@ -120,15 +128,42 @@ def find(kind: str, name: str) -> Any:
         raise UnknownName(f"class of {module_name}", attribute, classes) from None
 
 
+def lacks(kind: str, part: Any) -> tuple[str, ...]:
+    """Return which methods of a kind a class does not have; it is looked at, and not called.
+
+    >>> import subprocess
+    >>> lacks("detector", subprocess.Popen)
+    ('update', 'reset')
+    """
+    return tuple(name for name in METHODS.get(kind, ()) if not callable(inspect.getattr_static(part, name, None)))
+
+
+def _check_class(kind: str, name: str, part: Any) -> None:
+    # Before anything of it is called: what a name leads to may be any class or function that can be imported.
+    if not inspect.isclass(part):
+        raise ConfigError(
+            f"{kind} {name!r} is a {type(part).__name__}, and a part is made of a class. Name the class of it, "
+            '"module:Class"'
+        )
+    if missing := lacks(kind, part):
+        unseen = [value for value in VALUES.get(kind, ()) if not hasattr(part, value)]
+        raise ConfigError(_incomplete(kind, name, [*unseen, *missing]))
+
+
+def _incomplete(kind: str, name: str, missing: Sequence[str]) -> str:
+    return f"{kind} {name!r} has no {', '.join(missing)}; see {kind.capitalize()} in mape.ports"
+
+
 def options_of(kind: str, spec: PartSpec, where: str) -> tuple[Any, Any]:
     """Return the class of a part, and its options: a checked model, or a table where the class declares none.
 
     Raises
     ------
     ConfigError
-        An option is not legal.
+        It is no class with the methods of its kind, or an option is not legal.
     """
     part = find(kind, spec.name)
+    _check_class(kind, spec.name, part)
     model = getattr(part, "Config", None)
     if isinstance(model, type) and issubclass(model, BaseModel):
         try:
@@ -144,7 +179,7 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
     Raises
     ------
     ConfigError
-        The options are not legal, or the part cannot be made.
+        It is no class with the methods of its kind, the options are not legal, or the part cannot be made.
     """
     part, options = options_of(kind, spec, kind)
     try:
@@ -153,7 +188,7 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
         else:
             taken = {name: value for name, value in extra.items() if name in inspect.signature(part).parameters}
             made = part(**options, **taken)
-        missing = [member for member in MEMBERS.get(kind, ()) if not hasattr(made, member)]
+        missing = [value for value in VALUES.get(kind, ()) if not hasattr(made, value)]
     except ConfigError:
         raise
     except FAULTS as error:
@@ -161,5 +196,5 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
             f"{kind} {spec.name!r} cannot be made with {options or 'no options'}: {told(error)}"
         ) from error
     if missing:
-        raise ConfigError(f"{kind} {spec.name!r} has no {', '.join(missing)}; see {kind.capitalize()} in mape.ports")
+        raise ConfigError(_incomplete(kind, spec.name, missing))
     return made

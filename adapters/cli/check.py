@@ -19,15 +19,6 @@ from mape.specs import PartSpec, explain
 from mape.tables import Table, merge, parse_override
 from mape.testing import Finding
 
-# The members by which a class of one's own is told; the first kind that has them all.
-_MEMBERS = {
-    "detector": ("update", "reset"),
-    "analyzer": ("analyze",),
-    "planner": ("plan", "start"),
-    "schedule": ("advance", "reset"),
-    "learner": ("value", "step_size"),
-}
-
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command; exit code 1 where a clause is broken."""
@@ -103,12 +94,12 @@ def _kind_of(name: str) -> str:
             f"{module}:NAME-v0"
         )
     if inspect.isclass(part):
-        for kind, members in _MEMBERS.items():
-            if all(hasattr(part, member) for member in members):
+        for kind in registry.METHODS:
+            if not registry.lacks(kind, part):
                 return kind
     raise ConfigError(
         f"{name!r} has the members of no part: "
-        + "; ".join(f"a {kind} has {', '.join(members)}" for kind, members in _MEMBERS.items())
+        + "; ".join(f"a {kind} has {', '.join(methods)}" for kind, methods in registry.METHODS.items())
         + ". Name the kind with --kind to see what is missing."
     )
 

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 
 from adapters.cli.options import parser
+from adapters.cli.terminal import clean_streams
 
 # Nothing else is imported here: `mapek --help` must answer at once.
 
@@ -30,6 +31,11 @@ class OutputError(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
+    with clean_streams():
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     # Before NumPy is imported: a matrix product on several threads ends in other last bits on other numbers of cores.
     # Trials and roles are processes, and have the cores without it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

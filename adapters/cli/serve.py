@@ -11,6 +11,7 @@ from pathlib import Path
 
 from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, open_folder, prepare
+from adapters.cli.terminal import Clean
 from adapters.processes.serve import (
     Terminated,
     leash,
@@ -66,7 +67,7 @@ def _keep_standard_output() -> None:
     sys.stdout.flush()
     ours = os.dup(1)
     os.dup2(2, 1)
-    sys.stdout = os.fdopen(ours, "w", encoding="utf-8")
+    sys.stdout = Clean(os.fdopen(ours, "w", encoding="utf-8"))
 
 
 def _serve_with_results(chosen: argparse.Namespace, config: Config, wire: Wire, kept: dict[str, object]) -> None:

@@ -17,6 +17,7 @@ from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, finish, open_folder, prepare, say
 from adapters.cli.run import as_json, report
 from adapters.cli.sentences import sentence
+from adapters.cli.terminal import cleaned
 from adapters.experiments.runner import check
 from adapters.processes.export import export
 from adapters.processes.serve import Terminated, open_ledger, terminated_by_signal
@@ -167,7 +168,9 @@ class Screen:
             from rich.console import Console
             from rich.live import Live
 
-            self._live = Live(console=Console(stderr=True), transient=True, auto_refresh=False)
+            # It draws by control characters: past what cleans standard error, so that each text is cleaned by itself.
+            console = Console(file=getattr(sys.stderr, "stream", sys.stderr), markup=False)
+            self._live = Live(console=console, transient=True, auto_refresh=False)
             self._live.__enter__()
         return self
 
@@ -178,7 +181,7 @@ class Screen:
     def tell(self, sentence: str) -> None:
         """Say something beside the table."""
         if self._live is not None:
-            self._live.console.print(sentence)
+            self._live.console.print(cleaned(sentence))
         else:
             print(f"mapek: {sentence}", file=sys.stderr, flush=True)
 
@@ -202,7 +205,7 @@ class Screen:
     def _table(self, supervisor: Supervisor, title: str) -> Any:
         from rich.table import Table
 
-        table = Table(title=title, title_justify="left", expand=True)
+        table = Table(title=cleaned(title), title_justify="left", expand=True)
         for name in ("role", "pid", "pass", "restarts", "state"):
             table.add_column(name, no_wrap=True)
         table.add_column("last record", no_wrap=True, ratio=1, overflow="ellipsis")
@@ -218,5 +221,5 @@ class Screen:
             elif name == KNOWLEDGE and status is not None:
                 state, last = "here", f"{status.passes // max(1, status.units):,}"
                 said = f"{status.refused} refused, {status.dropped} dropped"
-            table.add_row(name, str(child.pid), last, str(child.restarts), state, said)
+            table.add_row(name, str(child.pid), last, str(child.restarts), state, cleaned(said))
         return table

@@ -21,6 +21,7 @@ from adapters.processes.remote import RemoteKnowledge
 from adapters.roles import STAGE_OF
 from adapters.stores.ledger import Fit, layout_from
 from knowledge import ChangePlan, MalformedRecord, Observation, Record, from_json, to_json
+from mape.allowed import check_part
 from mape.config import Config
 from mape.errors import BusError, ConfigError, MapekError, PartError
 from mape.execute.adoption import check_actions, fitting
@@ -160,8 +161,10 @@ class Replacing(ABC):
         self._vetted.append((wanted, found[0] if found else [late]))
 
     def _vet(self, wanted: Wanted) -> list[str]:
+        config = self.units[0].config
         try:
-            return vet(wanted.part, wanted.spec, self.units[0].config)
+            check_part(config, wanted.part, wanted.spec)
+            return vet(wanted.part, wanted.spec, config)
         except BaseException as error:  # a Ctrl-C is heard in the main thread: what comes here is the part's
             return [reason(error)]
 

@@ -20,6 +20,7 @@ from adapters.processes.remote import RemoteKnowledge
 from adapters.processes.replacing import Due, Replacing, Unit, spec_of
 from adapters.stores.ledger import layout_from
 from knowledge import ChangePlan, Record
+from mape.allowed import check_part
 from mape.analyze import Analyze
 from mape.config import Config
 from mape.errors import PartError
@@ -98,7 +99,9 @@ class Role(Replacing):
         joined = self.member.joined
         recorded: dict[int, list[Due]] = {}
         for swap in joined.swaps:
-            recorded.setdefault(swap.loop, []).append(Due(swap.pass_no, swap.part, spec_of(swap.to), planned=False))
+            spec = spec_of(swap.to)
+            check_part(self.config, swap.part, spec)
+            recorded.setdefault(swap.loop, []).append(Due(swap.pass_no, swap.part, spec, planned=False))
         planned = [Due(swap.pass_no, swap.part, swap.to, planned=True) for swap in self.config.swap]
         for loop in range(joined.units):
             swaps = [s for s in [*planned, *recorded.get(loop, [])] if owner(s.part) == self.name]

@@ -24,6 +24,7 @@ from knowledge import (
     RowLayout,
     Symptom,
 )
+from mape.allowed import check_part
 from mape.analyze import Analyze
 from mape.config import Config, SwapConfig
 from mape.errors import MapekError
@@ -235,11 +236,19 @@ class FedByLog:
 
 
 def with_swaps(config: Config, swaps: list[Swap], unit: int) -> Config:
-    """Return the config of one loop with the parts that were replaced while it ran, beside those it had planned."""
+    """Return the config of one loop with the parts that were replaced while it ran, beside those it had planned.
+
+    Raises
+    ------
+    ConfigError
+        One of them is of a module that is not imported because a log names it.
+    """
     live = [
         SwapConfig.model_validate({"pass": swap.pass_no, "part": swap.part, "to": PartSpec.model_validate(swap.spec)})
         for swap in swaps
         if swap.loop == unit and not swap.planned
     ]
+    for swap in live:
+        check_part(config, swap.part, swap.to)
     # A part may have been replaced twice at one pass, the second time live, which no config could plan.
     return config.model_copy(update={"swap": tuple(sorted([*config.swap, *live], key=lambda swap: swap.pass_no))})

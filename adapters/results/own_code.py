@@ -13,7 +13,8 @@ from typing import NamedTuple
 import gymnasium
 
 from mape import registry
-from mape.config import Config, parts_of
+from mape.allowed import named_modules
+from mape.config import Config
 
 _OURS = ("adapters", "knowledge", "managed_systems", "mape")
 
@@ -70,12 +71,8 @@ def _sha256_of(file: Path) -> str:
 
 def _named(config: Config) -> Iterator[str]:
     """Yield the modules that a config names, and that of its environment's class where it is registered."""
-    for kind, _, spec in parts_of(config):
-        if spec.name not in registry.PARTS[kind]:
-            yield spec.name.partition(":")[0]
-    module, colon, identifier = config.system.id.rpartition(":")
-    if colon:
-        yield module
+    yield from named_modules(config)
+    identifier = config.system.id.rpartition(":")[2]
     if identifier in gymnasium.registry:
         made = gymnasium.registry[identifier].entry_point
         yield made.partition(":")[0] if isinstance(made, str) else str(getattr(made, "__module__", ""))

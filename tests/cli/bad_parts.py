@@ -42,7 +42,7 @@ class Nothing:
     pass
 
 
-class Picky:
+class Picky(Quiet):
     def __init__(self, size):
         raise ValueError(f"size {size} is odd")
 

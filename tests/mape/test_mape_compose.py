@@ -422,3 +422,35 @@ def test_a_temporary_folder_in_which_others_could_put_code_is_not_used(nowhere_e
     planted(nowhere_else)
     with pytest.raises(ConfigError, match="name one in MAPEK_CACHE"):
         cache_folder()
+
+
+@pytest.fixture
+def named_cache(tmp_path, monkeypatch):
+    folder = tmp_path / "named"
+    folder.mkdir(mode=0o700)
+    monkeypatch.setenv("MAPEK_CACHE", str(folder))
+    return folder
+
+
+def test_a_cache_that_others_can_write_is_refused(named_cache):
+    named_cache.chmod(0o770)
+    with pytest.raises(ConfigError, match=r"MAPEK_CACHE is '.*named'.*open to others.*new"):
+        cache_folder()
+    named_cache.chmod(0o755)
+    assert cache_folder() == named_cache
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder to somebody else")
+def test_a_cache_of_another_owner_is_refused(named_cache):
+    os.chown(named_cache, 65534, 65534)
+    with pytest.raises(ConfigError, match=r"MAPEK_CACHE is '.*named'.*belongs to the user with the number 65534"):
+        cache_folder()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder to somebody else")
+def test_a_users_cache_folder_of_another_owner_is_passed_by(nowhere_else, tmp_path, monkeypatch):
+    monkeypatch.delenv("MAPEK_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    (tmp_path / "home" / "mapek").mkdir(parents=True)
+    os.chown(tmp_path / "home" / "mapek", 65534, 65534)
+    assert cache_folder() == nowhere_else
