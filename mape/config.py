@@ -1,7 +1,8 @@
 """Configs: TOML (or JSON) -> frozen pydantic models. An experiment is data: what runs, how long, which seeds.
 
 A file may name another one to start from (``extends``), and hold overlays: ``[profiles.NAME]`` and ``[agents.NAME]``
-are tables laid over the rest when that profile or agent is chosen. Overrides (``plan.alpha=0.2``) come last. A table
+are tables laid over the rest when that profile or agent is chosen; those of the file that is extended are among them,
+and one of the same name is laid over the other's. Overrides (``plan.alpha=0.2``) come last. A table
 that names a part or system (``name = ...``, ``id = ...``) takes the place of one that names another; else tables are
 merged.
 """

@@ -43,9 +43,6 @@ def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
     if path.resolve() in _seen:
         raise ConfigError(f"{path} extends itself, by way of {' -> '.join(p.name for p in _seen)}")
     below = read_table(path.parent / base, (*_seen, path.resolve()))
-    # What a file adds to another stands for itself: the other's overlays are not its own.
-    below.pop("agents", None)
-    below.pop("profiles", None)
     return merge(below, table)
 
 

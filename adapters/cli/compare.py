@@ -11,8 +11,9 @@ import numpy as np
 
 from adapters.cli.common import config_of, finish, open_folder, prepare, say
 from adapters.experiments.decimals import number, resolution
+from adapters.experiments.pairing import Pairing, pairing
 from adapters.experiments.runner import run_agents
-from adapters.experiments.statistics import Comparison, compare, holm, summary
+from adapters.experiments.statistics import Comparison, compare, holm, of_few, summary
 from mape.config import Config, overlays_of
 from mape.errors import ConfigError, UnknownName
 from mape.trials import combined_hash
@@ -39,12 +40,26 @@ def execute(chosen: argparse.Namespace) -> int:
                 "log_sha256": combined_hash(r.log_sha256 for r in results[agent]),
                 "q_table_sha256": combined_hash(r.q_table_sha256 for r in results[agent]),
             }
-        against = {agent: compare(returns[first], returns[agent]) for agent in configs if agent != first}
+        pairings = {agent: pairing(configs[first], configs[agent]) for agent in configs if agent != first}
+        against = {
+            agent: compare(returns[first], returns[agent], paired=how.kind == "paired")
+            for agent, how in pairings.items()
+            if how.kind != "apart"
+        }
         welch = holm([found.p for found in against.values()])
         paired = holm([found.paired_p for found in against.values()])
+        for agent, how in pairings.items():
+            rows[agent]["pairing"] = how._asdict()
         for (agent, found), p, paired_p in zip(against.items(), welch, paired, strict=True):
             rows[agent]["against_first"] = found._asdict() | {"p_holm": p, "paired_p_holm": paired_p}
-        _print(chosen, configs, first, rows, against, paired)
+        _print_agents(chosen, configs[first], rows)
+        _print_paired(chosen, configs[first], first, _of_kind("paired", pairings, against), rows)
+        _print_independent(chosen, first, _of_kind("independent", pairings, against), rows, pairings)
+        for agent, how in pairings.items():
+            if how.kind == "apart":
+                say(chosen, f"\n{agent} is not held against {first}: {how.reason}. Two systems have no common scale.")
+        if (few := of_few(configs[first].trials)) is not None and against:
+            say(chosen, f"\n{few}")
         figures = []
         if not chosen.no_figures:
             from adapters.experiments.pictures import pictures_of_compare
@@ -94,15 +109,11 @@ def _configs(chosen: argparse.Namespace) -> dict[str, Config]:
     return found
 
 
-def _print(
-    chosen: argparse.Namespace,
-    configs: dict[str, Config],
-    first: str,
-    rows: dict[str, Any],
-    against: dict[str, Comparison],
-    corrected: list[float | None],
-) -> None:
-    some = configs[first]
+def _of_kind(kind: str, pairings: dict[str, Pairing], against: dict[str, Comparison]) -> dict[str, Comparison]:
+    return {agent: found for agent, found in against.items() if pairings[agent].kind == kind}
+
+
+def _print_agents(chosen: argparse.Namespace, some: Config, rows: dict[str, Any]) -> None:
     loops = f" with {some.loops:,} loops" if some.loops > 1 else ""
     trials, episodes = _counted(some.trials, "trial"), _counted(some.episodes, "episode")
     say(chosen, f"{len(rows)} agents, {trials}{loops} of {episodes} each, seed {some.seed}\n")
@@ -114,22 +125,67 @@ def _print(
         interval = _interval(total["interval"], exact) if total["interval"] else ""
         lines.append((agent, _with_sd(total, exact), interval, _with_sd(steps, steady), f"{row['alarms']:.2f}"))
     _say_table(chosen, lines, (26, 26, 22, 9))
+    if some.units > 1:
+        say(chosen, f"\nmean ± standard deviation over the {_units(some)}; 95 % bootstrap interval of the mean")
+
+
+def _units(some: Config) -> str:
+    return "trials" if some.loops == 1 else "loops of all trials"
+
+
+def _print_paired(
+    chosen: argparse.Namespace, some: Config, first: str, against: dict[str, Comparison], rows: dict[str, Any]
+) -> None:
+    if not against:
+        return
     unit, units = ("trial", "trials") if some.loops == 1 else ("loop of a trial", "loops of a trial")
     say(chosen, f"\nagainst {first}, total return, paired by {unit}")
     exact = resolution(found.interval for found in against.values())
-    lines = [("", "difference", "95 % interval", "effect size", "Welch t", "paired p (Holm)")]
-    for (agent, found), p in zip(against.items(), corrected, strict=True):
-        interval = "-" if found.interval is None else _interval(found.interval, exact, "+")
-        effect = "-" if found.paired_effect is None else f"{found.paired_effect:+.2f}"
+    lines: list[tuple[str, ...]] = [("", "difference", "95 % interval", "effect size", "Welch t", "paired p (Holm)")]
+    for agent, found in against.items():
         t = "-" if found.t is None else f"{found.t:.2f}"
-        said = "-" if p is None else f"{p:.2g}"
-        lines.append((agent, number(found.difference, exact, "+"), interval, effect, t, said))
+        ends = (_effect(found.paired_effect), t, _p(rows[agent]["against_first"]["paired_p_holm"]))
+        lines.append((agent, *_difference(found, exact), *ends))
     _say_table(chosen, lines, (14, 24, 13, 10, 17))
     say(
         chosen,
-        "\nAll agents run on the same seeds: interval, effect size (mean / sd of the differences) and paired t test"
+        "\nThese agents run on the same seeds: interval, effect size (mean / sd of the differences) and paired t test"
         f"\nrest on the differences within {units}. Welch's t takes the samples as independent.",
     )
+
+
+def _print_independent(
+    chosen: argparse.Namespace,
+    first: str,
+    against: dict[str, Comparison],
+    rows: dict[str, Any],
+    pairings: dict[str, Pairing],
+) -> None:
+    if not against:
+        return
+    say(chosen, f"\nagainst {first}, total return, as independent samples")
+    exact = resolution(found.interval for found in against.values())
+    lines: list[tuple[str, ...]] = [("", "difference", "95 % interval", "Hedges g", "Welch t", "p (Holm)")]
+    for agent, found in against.items():
+        t = "-" if found.t is None else f"{found.t:.2f}"
+        ends = (_effect(found.hedges_g), t, _p(rows[agent]["against_first"]["p_holm"]))
+        lines.append((agent, *_difference(found, exact), *ends))
+    _say_table(chosen, lines, (14, 24, 13, 10, 17))
+    reasons = "; ".join(dict.fromkeys(pairings[agent].reason for agent in against))
+    say(chosen, f"\nThese trials are no pairs: {reasons}. Interval and Welch's t take the trials as independent samples.")
+
+
+def _difference(found: Comparison, exact: float) -> tuple[str, str]:
+    interval = "-" if found.interval is None else _interval(found.interval, exact, "+")
+    return number(found.difference, exact, "+"), interval
+
+
+def _effect(effect: float | None) -> str:
+    return "-" if effect is None else f"{effect:+.2f}"
+
+
+def _p(p: float | None) -> str:
+    return "-" if p is None else f"{p:.2g}"
 
 
 def _say_table(chosen: argparse.Namespace, lines: Sequence[Sequence[str]], widths: Sequence[int]) -> None:

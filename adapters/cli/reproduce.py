@@ -22,7 +22,7 @@ from adapters.experiments.metrics import (
     trailing_mean,
 )
 from adapters.experiments.runner import drifts_of, experiment_config, run_agents
-from adapters.experiments.statistics import Comparison, compare, summary
+from adapters.experiments.statistics import Comparison, compare, of_few, summary
 from adapters.results import RunFolder
 from adapters.systems import make_system
 from mape.config import Config
@@ -54,6 +54,8 @@ def execute(chosen: argparse.Namespace) -> int:
             result |= _steps(chosen, results)
         else:
             result |= kind(chosen, folder, configs, results)
+            if (few := of_few(configs[agents[0]].trials)) is not None:
+                say(chosen, f"\n{few}")
         result |= {
             "log_sha256": combined_hash(r.log_sha256 for agent in agents for r in results[agent]),
             "q_table_sha256": combined_hash(r.q_table_sha256 for agent in agents for r in results[agent]),
@@ -126,6 +128,7 @@ def _table1(
         "\nconv.: share of trials that converge: first episode of the stage at whose end max|change of Q| < 0.01,"
         "\n  counted only where the stage before converged; one that did not converge is censored, not late."
         "\nperf.: share of trials that recover by performance: 10 episodes in a row of at most 18 steps."
+        "\nfound, paper: mean ± standard deviation over the trials; the interval is that of the mean, by bootstrap."
         "\nd: difference of the means in the paper's standard deviations of one trial."
         "\nz: difference of the means in our standard errors, sd / sqrt(n); the paper's own n is not known."
         "\nWhat the ratio does not say: it is mostly a weak baseline (README, What is honest to claim).",

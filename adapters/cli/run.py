@@ -100,6 +100,8 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
         say(chosen, f"alarms:   {alarms}" + (" (episodes)" if results[0].alarms else ""))
     else:
         say(chosen, f"alarms:   {np.mean([len(r.alarms) for r in results]):.2f} per {unit}")
+    if config.units > 1:
+        say(chosen, f"          (mean ± standard deviation over the {units})")
     if config.execute.mode == "free":
         say(chosen, "log:      no hash, as no free-running loop is the same twice")
     else:

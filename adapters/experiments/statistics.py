@@ -16,6 +16,9 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 RESAMPLES = 4999
 
+FEW = 10
+"""Trials below which intervals and tests are said to be of few."""
+
 
 class Summary(NamedTuple):
     """Mean, standard deviation (n - 1), number, and 95 % bootstrap interval of the mean (None below 2 values)."""
@@ -27,16 +30,17 @@ class Summary(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Second sample against the first, both of the same trials.
+    """Second sample against the first, both of the same number of trials.
 
     Agents that share their trials' seeds share some of their luck, and the differences within trials are free of what
     they share: the intervals and the `paired_` fields rest on those. Welch's test and Hedges' g take the samples as
-    independent, which they are not; they stand here for comparison with what others print.
+    independent, which they are not; they stand here for comparison with what others print. Where nothing is shared they
+    are what there is: then the intervals are of independent samples, and the `paired_` fields None.
 
     Attributes
     ----------
     difference : mean of the second minus mean of the first.
-    interval : 95 % bootstrap interval of it, paired: whole trials are drawn.
+    interval : 95 % bootstrap interval of it; where the samples are paired, whole trials are drawn.
     ratio, ratio_interval : mean of the second over mean of the first, and the same interval of it; None where that says
         nothing.
     hedges_g : difference in units of the pooled standard deviation, corrected for small samples.
@@ -72,11 +76,18 @@ def summary(values: Floats) -> Summary:
 
 
 @np.errstate(all="ignore")
-def compare(first: Floats, second: Floats) -> Comparison:
-    """Compare two samples whose values go together: the same trials, with the same seeds, in the same order.
+def compare(first: Floats, second: Floats, *, paired: bool = True) -> Comparison:
+    """Compare two samples.
 
     What the samples cannot say is None: below two trials everything but difference and ratio, where neither sample
     varies both tests, and where all differences are equal their interval and the paired test.
+
+    Parameters
+    ----------
+    first, second
+        A value per trial.
+    paired
+        Whether the values go together: the same trials, with the same seeds, in the same order.
 
     Raises
     ------
@@ -96,8 +107,23 @@ def compare(first: Floats, second: Floats) -> Comparison:
         return found
     found = _welch(found, first, second)
     if ratio is not None:
-        found = found._replace(ratio_interval=_interval(_ratio, first, second))
+        found = found._replace(ratio_interval=_interval(_ratio, first, second, paired=paired))
+    if not paired:
+        return found._replace(interval=_interval(_difference, first, second, paired=False))
     return _paired(found, first, second)
+
+
+def of_few(trials: int) -> str | None:
+    """Say what is to be said of intervals and tests of so few trials; None where they are not few.
+
+    >>> of_few(10)
+    """
+    if not 1 < trials < FEW:
+        return None
+    return (
+        f"{trials} trials are few: intervals of fewer than {FEW} come out too narrow, and tests rest on a normal "
+        "distribution that nobody has seen. Give more --trials before anything is claimed."
+    )
 
 
 def _welch(found: Comparison, first: Floats, second: Floats) -> Comparison:
@@ -179,8 +205,8 @@ def _ratio(first: Floats, second: Floats, axis: int = -1) -> Any:
     return np.mean(second, axis=axis) / np.mean(first, axis=axis)
 
 
-def _interval(statistic: Callable[..., Any], *samples: Floats) -> tuple[float, float] | None:
-    """Return the 95 % bootstrap interval; several samples are paired, that is, drawn with the same indices."""
+def _interval(statistic: Callable[..., Any], *samples: Floats, paired: bool = True) -> tuple[float, float] | None:
+    """Return the 95 % bootstrap interval; several samples that are paired are drawn with the same indices."""
     from scipy import stats
 
     if all(_constant(sample) for sample in samples):
@@ -195,7 +221,7 @@ def _interval(statistic: Callable[..., Any], *samples: Floats) -> tuple[float, f
             samples,
             statistic,
             n_resamples=RESAMPLES,
-            paired=len(samples) > 1,
+            paired=paired and len(samples) > 1,
             method=method,
             vectorized=True,
             batch=500,

@@ -72,7 +72,7 @@ def test_the_number_of_trials_of_a_file_is_run_if_it_says_one(mapek: Mapek, here
         (here / "own.toml").write_text(
             f"extends = '{GOALS}'\ntrials = {number}\nepisodes = 1\n[agents.a]\n[agents.b]\nplan = 'q_learning'\n"
         )
-        outcome = mapek("compare", "own.toml", *QUIETLY)
+        outcome = mapek("compare", "own.toml", "--agents", "a,b", *QUIETLY)
         assert outcome.code == 0, outcome.err
         said = {1: "1 trial of 1 episode each", 2: "2 trials of 1 episode each"}[number]
         assert f"2 agents, {said}, seed 0\n" in outcome.out
