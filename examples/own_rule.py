@@ -54,6 +54,6 @@ class Ewma:
 
 if __name__ == "__main__":
     for engine in ("compiled", "python"):
-        config = load("examples/own_rule.toml", overrides=[f"execute.engine={engine}"])
+        config = load("own_rule", overrides=[f"execute.engine={engine}"])
         done = run_trial(config, 0, make_system)
         print(f"{engine:<10}{done.log_sha256}  alarms {done.alarms}")

@@ -26,5 +26,5 @@ class Failures:
 
 if __name__ == "__main__":
     line = 'monitor.detectors=["swap_detector:Failures"]'
-    config = load("examples/gridworld_goals.toml", overrides=[line])
+    config = load("gridworld_goals", overrides=[line])
     print(run_trial(config, 0, make_system).alarms)

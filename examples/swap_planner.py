@@ -13,5 +13,5 @@ class Gentle(Morphin):
 
 if __name__ == "__main__":
     for planner in ("morphin", "swap_planner:Gentle"):
-        config = load("examples/traffic.toml", overrides=[f"plan.name={planner}", "episodes=4000"])
+        config = load("traffic", overrides=[f"plan.name={planner}", "episodes=4000"])
         print(planner, run_trial(config, 0, make_system).alarms)

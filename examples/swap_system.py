@@ -24,5 +24,5 @@ gymnasium.register("Levers-v0", Levers, max_episode_steps=10)
 if __name__ == "__main__":
     lines = ["system={id='Levers-v0'}", "episodes=200", "plan.schedule.decay=0.1"]
     watch = 'monitor.detectors=[{name="page_hinkley", threshold=10.0}]'
-    config = load("examples/frozen_lake.toml", overrides=[*lines, watch])
+    config = load("frozen_lake", overrides=[*lines, watch])
     print(run_trial(config, 0, make_system).alarms)

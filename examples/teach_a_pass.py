@@ -6,7 +6,7 @@ from knowledge import Knowledge, Log
 from mape import load
 from mape.loop import build_analyze, build_execute, build_monitor, build_plan, layout_of
 
-config = load("examples/gridworld_goals.toml")
+config = load("gridworld_goals")
 system = make_system(config.system)
 knowledge = Knowledge(Log(layout_of(config, system)))
 said = []

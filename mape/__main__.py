@@ -2,7 +2,7 @@
 
 import sys
 
-from adapters.cli.main import main
+from mapek import main
 
 if __name__ == "__main__":
     sys.exit(main())

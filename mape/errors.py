@@ -15,9 +15,10 @@ or with 2 for a ConfigError.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import Any
+
+from mape.near import did_you_mean, nearest
 
 
 class MapekError(Exception):
@@ -33,8 +34,7 @@ class UnknownName(ConfigError):
 
     def __init__(self, what: str, name: str, legal: Iterable[str], way_out: str = "") -> None:
         legal = sorted(legal)
-        close = difflib.get_close_matches(name, legal, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else "."
+        hint = did_you_mean(nearest(name, legal))
         known = f" Known: {', '.join(legal)}." if legal else ""
         super().__init__(f"unknown {what} {name!r}{hint}{known}{' ' if way_out else ''}{way_out}")
 

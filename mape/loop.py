@@ -114,7 +114,7 @@ class Loop:
     --------
     >>> from mape.config import load
     >>> from adapters.systems import make_system
-    >>> config = load("examples/gridworld_goals.toml")
+    >>> config = load("gridworld_goals")
     >>> loop = Loop(config, make_system(config.system))
     >>> loop.run(3)
     >>> loop.log.window[-1].plan.pass_no

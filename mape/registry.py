@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
+from mape.config_files import examples
 from mape.errors import ConfigError, UnknownName
 from mape.specs import PartSpec, explain
 from mape.states import FAULTS, told
@@ -75,9 +76,13 @@ def register(kind: str, name: str, target: str, summary: str) -> None:
 
 
 def look_here() -> None:
-    """Let modules in the present folder be found: the console script does not look there; `python -m` does."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
+    """Let modules in the present folder be found, and after all others those of the examples.
+
+    The console script does not look here; `python -m` does.
+    """
+    for folder in (os.getcwd(), last := str(examples())):
+        if folder not in sys.path:
+            sys.path.insert(sys.path.index(last) if last in sys.path else len(sys.path), folder)
 
 
 def import_for(named: str, module_name: str) -> ModuleType:

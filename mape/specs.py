@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mape.near import did_you_mean, nearest
 
 
 class PartConfig(BaseModel):
@@ -40,8 +41,7 @@ def explain(error: ValidationError, prefix: str, model: type[BaseModel]) -> str:
         message = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "extra_forbidden":
             legal = _fields_at(model, problem["loc"][:-1])
-            close = difflib.get_close_matches(str(problem["loc"][-1]), legal, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else "."
+            hint = did_you_mean(nearest(str(problem["loc"][-1]), legal))
             message = f"no such option{hint} Legal: {', '.join(legal) or 'none'}"
         elif problem["type"] == "missing":
             message = "is needed and missing"

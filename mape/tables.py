@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import sysconfig
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mape.config_files import find_config
 from mape.errors import ConfigError
 
 Table = dict[str, Any]
@@ -18,19 +18,17 @@ TOO_DEEP = "tables or lists within one another, more than can be read; a config 
 """What is said of them."""
 
 
-def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
-    """Read a TOML or JSON file and what it extends."""
-    path = Path(path)
+def read_table(named: str | Path, _from: Path | None = None, _seen: tuple[Path, ...] = ()) -> Table:
+    """Read a TOML or JSON file, or one of the examples by its bare name, and what it extends."""
+    path = find_config(named, _from)
     try:
         text = path.read_text(encoding="utf-8")
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except FileNotFoundError:
-        raise ConfigError(f"no config file {str(path)!r}; ready-made ones stand in {_examples()}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
         kind = "JSON" if path.suffix == ".json" else "TOML"
         raise ConfigError(f"{path} is not valid {kind}: {error}") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"config file {str(path)!r} cannot be read: {error}") from None
     except RecursionError:
         raise ConfigError(f"{path} holds {TOO_DEEP}") from None
     if not isinstance(table, dict):
@@ -42,13 +40,8 @@ def read_table(path: str | Path, _seen: tuple[Path, ...] = ()) -> Table:
         raise ConfigError(f"{path}: extends = {base!r} is not the path of another config file")
     if path.resolve() in _seen:
         raise ConfigError(f"{path} extends itself, by way of {' -> '.join(p.name for p in _seen)}")
-    below = read_table(path.parent / base, (*_seen, path.resolve()))
+    below = read_table(base, path.parent, (*_seen, path.resolve()))
     return merge(below, table)
-
-
-def _examples() -> str:
-    installed = Path(sysconfig.get_path("data"), "share", "mapek", "examples")
-    return str(installed) if installed.is_dir() else "the folder examples of the project"
 
 
 def merge(base: Table, over: Table) -> Table:

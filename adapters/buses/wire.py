@@ -284,7 +284,7 @@ def role_of(kind: type[Record]) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions that the processes of a run compare."""
-    from adapters.results.folder import versions as of_results
+    from adapters.versions import versions as of_results
 
     return {**of_results(), "wire": str(WIRE_VERSION)}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +12,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from adapters.cli.common import config_of, prepare
+from adapters.systems import SYSTEMS
 from mape import registry, testing
 from mape.config import PlannerSpec, SystemConfig
+from mape.config_files import SUFFIXES, find_config, shipped
 from mape.errors import ConfigError, UnknownName
 from mape.parts import make
 from mape.specs import PartSpec, explain
@@ -23,7 +26,7 @@ from mape.testing import Finding
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command; exit code 1 where a clause is broken."""
     prepare()
-    if Path(chosen.name).suffix in (".toml", ".json"):
+    if _is_config(chosen.name):
         kind, name, findings = _of_config(chosen)
     else:
         kind, name, findings = _of_name(chosen)
@@ -33,6 +36,18 @@ def execute(chosen: argparse.Namespace) -> int:
     broken = sum(finding.verdict == "failed" for finding in findings)
     print(f"{len(findings)} checks, {broken} failed" if broken else f"{len(findings)} checks, all kept")
     return 1 if broken else 0
+
+
+def _is_config(name: str) -> bool:
+    """Whether a name is that of a config: by its suffix, or a bare one that no part has."""
+    if Path(name).suffix in SUFFIXES:
+        return True
+    if ":" in name or any(name in parts for parts in registry.PARTS.values()):
+        return False
+    with contextlib.suppress(ConfigError):
+        find_config(name)
+        return True
+    return False
 
 
 def _of_config(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
@@ -81,8 +96,9 @@ def _kind_of(name: str) -> str:
             return "system"
         known = {part for parts in registry.PARTS.values() for part in parts}
         raise UnknownName(
-            "part or system", name, known, 'A part of your own is "module:Class", a system a Gymnasium id.'
-        )
+            "part, system or config", name, {*known, *SYSTEMS, *shipped()},
+            'A part of your own is "module:Class", a system a Gymnasium id, a config a file.',
+        )  # fmt: skip
     if module:
         registry.import_for(f"part or system {name!r}", module)  # which registers its environments
     if is_registered(attribute):

@@ -22,6 +22,7 @@ from adapters.results import RunFolder
 from adapters.results.files import cannot_write, try_whole, write_json
 from adapters.results.folder import default_path
 from mape.config import Config, load
+from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
 from mape.parts import cautions
 from mape.tables import parse_override
@@ -38,8 +39,12 @@ def prepare() -> None:
 def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = None, **defaults: Any) -> Config:
     """Load a config with the command line's profile, overrides, seed, trials and engine laid over it.
 
-    `defaults` fill what the command line leaves open.
+    `defaults` fill what the command line leaves open. Which file a bare name stands for is said, once.
     """
+    found = find_config(path)
+    if found != Path(path) and path not in (told := vars(chosen).setdefault("told", set())):
+        told.add(path)
+        print(f"{path} is {found}", file=sys.stderr)
     overrides = list(chosen.overrides)
     given = {key for override in overrides for key in parse_override(override)}
     for key in ("seed", "trials"):

@@ -61,7 +61,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 def _version() -> int:
-    from adapters.results.folder import versions
+    from adapters.versions import versions
 
     print(", ".join(f"{name} {version}" for name, version in versions().items()))
     return 0
@@ -76,29 +76,9 @@ def dispatch(chosen: argparse.Namespace) -> int:
     """Run the command that was chosen; return its exit code."""
     import importlib
 
-    if (sentence := _shadowed()) is not None:
-        print(f"mapek: {sentence}", file=sys.stderr)
-        return 1
     module = importlib.import_module(f"adapters.cli.{chosen.command}")
     code: int = module.execute(chosen)
     return code
-
-
-def _shadowed() -> str | None:
-    """Say which package of another project stands in the way of one of ours, if any does."""
-    import importlib.util
-
-    home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    for name in ("knowledge", "mape", "managed_systems"):
-        spec = importlib.util.find_spec(name)
-        found = "nowhere" if spec is None else spec.origin or "a folder without __init__.py"
-        if os.path.dirname(os.path.dirname(os.path.abspath(found))) != home:
-            return (
-                f"the package {name!r} is found at {found}, not beside mapek's own in {home}: a package of another "
-                "project, or a folder, stands in its way. Install mapek into a virtual environment of its own, and "
-                "look at PYTHONPATH and at the folder you stand in."
-            )
-    return None
 
 
 def _failed(error: Exception) -> int:

@@ -9,15 +9,18 @@ import argparse
 DESCRIPTION = "Self-adaptive systems as an explicit Monitor - Analyze - Plan - Execute loop over shared Knowledge."
 EPILOG = """\
 examples:
-  mapek reproduce table1                                    the paper's Table 1, 1,000 trials, both agents
-  mapek run examples/frozen_lake.toml --seed 7              one run of any Gymnasium environment
-  mapek run examples/gridworld_goals.toml --show 298:305    what each part says, pass by pass
-  mapek compare examples/gridworld_goals.toml --trials 50   all agents of a config on the same seeds
-  mapek run examples/traffic.toml --set 'monitor.detectors=["two_window"]'
-  mapek up examples/gridworld_goals.toml                    the same loop as five processes
+  mapek reproduce table1                           the paper's Table 1, 1,000 trials, both agents
+  mapek examples                                   the configs that are shipped, by the names used below
+  mapek run frozen_lake --seed 7                   one run of any Gymnasium environment
+  mapek run gridworld_goals --show 298:305         what each part says, pass by pass
+  mapek compare gridworld_goals --trials 50        all agents of a config on the same seeds
+  mapek run traffic --set 'monitor.detectors=["two_window"]'
+  mapek up gridworld_goals                         the same loop as five processes
 
 exit codes: 0 done, 1 failure, 2 usage, 130 stopped by Ctrl-C (finished trials are kept), 143 by SIGTERM
 """
+
+_CONFIG = "TOML file, an example by its name (`mapek examples`), or the config-*.json of an earlier run"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -34,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
 
     run = commands.add_parser("run", help="run a config; results go into a folder", description="Run a config.")
-    run.add_argument("config", metavar="CONFIG", help="TOML file, or the config-*.json of an earlier run")
+    run.add_argument("config", metavar="CONFIG", help=_CONFIG)
     run.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
     _what_runs(run)
     _where_to(run)
@@ -49,7 +52,10 @@ def parser() -> argparse.ArgumentParser:
         description="Run configs on the same seeds: one table, with effect sizes, intervals and tests.",
     )
     compare.add_argument(
-        "configs", nargs="+", metavar="CONFIG", help="config files; one alone is compared over its agents"
+        "configs",
+        nargs="+",
+        metavar="CONFIG",
+        help="config files, or examples by name; one alone is compared over its agents",
     )
     compare.add_argument("--agents", metavar="A,B", help="of the configs' agents, only these")
     _what_runs(compare)
@@ -75,7 +81,7 @@ def parser() -> argparse.ArgumentParser:
     step = commands.add_parser(
         "step", help="advance record by record on Enter", description="Step through a run, record by record."
     )
-    step.add_argument("config", metavar="CONFIG")
+    step.add_argument("config", metavar="CONFIG", help=_CONFIG)
     step.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
     _overlays(step)
     step.add_argument(
@@ -88,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
         description="Run a config as five processes on this machine: Knowledge, Monitor, Analyze, Plan, Execute. They "
         "are watched, and started again when they die; what comes out is what `mapek run` gives, bit for bit.",
     )
-    up.add_argument("config", metavar="CONFIG", help="TOML file, or the config-*.json of an earlier run")
+    up.add_argument("config", metavar="CONFIG", help=_CONFIG)
     up.add_argument("--agent", metavar="NAME", help="lay the config's [agents.NAME] over it")
     _overlays(up)
     up.add_argument("--trials", type=_positive, metavar="N", help="independent repetitions, side by side")
@@ -198,6 +204,14 @@ def parser() -> argparse.ArgumentParser:
         description="Print the AsyncAPI 3.0 document of the wire, generated from the code.",
     )
     schema.add_argument("--out", metavar="FILE", help="write it there instead")
+
+    examples = commands.add_parser(
+        "examples",
+        help="configs and programs that are shipped: listed, or copied",
+        description="List the examples. `mapek run NAME` finds a config among them by its bare name, where no file "
+        "here has it. With DIR, copy all into that folder, overwriting nothing.",
+    )
+    examples.add_argument("folder", nargs="?", metavar="DIR", help="copy them into this folder, which may be new")
 
     commands.add_parser("list", help="systems, detectors, planners, schedules, learners: one line each")
 

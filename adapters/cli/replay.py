@@ -16,9 +16,10 @@ from adapters.cli.sentences import ids, sentence
 from adapters.replay.records import Difference, LogReplay, Moment, Replayed, as_json, log_of
 from adapters.replay.tables import replay_tables
 from adapters.results.files import read_json
-from adapters.results.folder import MENDED, MODULES, read_manifest, versions
+from adapters.results.folder import MENDED, MODULES, read_manifest
 from adapters.results.own_code import other_versions
 from adapters.stores import Store
+from adapters.versions import versions
 from mape.errors import ConfigError
 from mape.trials import combined_hash
 

@@ -21,11 +21,12 @@ from adapters.experiments.metrics import (
     shortest_path,
     trailing_mean,
 )
-from adapters.experiments.runner import drifts_of, experiment_config, run_agents
+from adapters.experiments.runner import drifts_of, run_agents
 from adapters.experiments.statistics import Comparison, compare, of_few, summary
 from adapters.results import RunFolder
 from adapters.systems import make_system
 from mape.config import Config
+from mape.config_files import shipped
 from mape.errors import ConfigError
 from mape.trials import TrialResult, combined_hash
 
@@ -36,7 +37,7 @@ def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
     prepare()
     kind, file, agents, trials, profile, trace = _EXPERIMENTS[chosen.experiment]
-    path = experiment_config(file)
+    path = shipped()[file]
     profile = chosen.profile or profile
     configs = {agent: config_of(path, chosen, agent, trials=trials, profile=profile) for agent in agents}
     for config in configs.values():

@@ -13,6 +13,7 @@ from typing import Any
 from adapters.cli.main import dispatch
 from adapters.cli.options import parser
 from adapters.results.folder import read_manifest
+from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
 
 
@@ -58,7 +59,10 @@ def _parsed(command: list[str], folder: Path) -> argparse.Namespace:
 def _find_config(again: argparse.Namespace, manifest: dict[str, Any], opened: contextlib.ExitStack) -> None:
     """Take the config as the folder keeps it where the file that was named is gone."""
     path = getattr(again, "config", None)
-    if path is None or Path(path).exists():
+    if path is None:
+        return
+    with contextlib.suppress(ConfigError):
+        find_config(path)
         return
     label, config = next(iter(manifest["agents"].items()))
     # With all that the command line had laid over it; an agent is named once more, for files are named after it.

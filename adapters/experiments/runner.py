@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, NamedTuple
 
@@ -281,24 +280,3 @@ def drifts_of(config: Config) -> tuple[int, ...]:
     system = make_system(config.system)
     system.close()
     return tuple(drift for drift in system.drifts if drift <= config.episodes)
-
-
-def experiment_config(name: str) -> Path:
-    """Return the path of a ready-made config: of the checkout, or as the installed wheel carries it.
-
-    Raises
-    ------
-    MapekError
-        It is nowhere.
-    """
-    import sysconfig
-
-    here = Path(__file__).resolve().parents[2]
-    for folder in (
-        here / "examples",
-        here / "share" / "mapek" / "examples",
-        Path(sysconfig.get_path("data"), "share", "mapek", "examples"),
-    ):
-        if (folder / f"{name}.toml").exists():
-            return folder / f"{name}.toml"
-    raise MapekError(f"the experiment {name}.toml is not installed; install mapek again")

@@ -21,11 +21,9 @@ import fcntl
 import itertools
 import json
 import os
-import platform
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -37,7 +35,7 @@ from adapters.results.chunk import read_arrays, read_chunk, remove_parts
 from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
 from adapters.results.own_code import other_versions, own_modules
 from adapters.results.table import read_episodes, read_last, write_npz
-from mape import __version__
+from adapters.versions import versions
 from mape.config import Config
 from mape.errors import MapekError, ResultsError
 from mape.tables import first_difference
@@ -54,17 +52,6 @@ MODULES = "modules"
 
 MENDED = "mended"
 """Entry for what modules of the user's own were when the run was begun, or gone on with, and are no more."""
-
-
-def versions() -> dict[str, str]:
-    """Return the versions on which the bits of a run depend, and the processor's architecture."""
-    return {
-        "mapek": __version__,
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in ("numpy", "numba", "llvmlite", "gymnasium")},
-        "libc": "-".join(platform.libc_ver()),
-        "architecture": platform.machine(),
-    }
 
 
 def default_path(name: str) -> Path:

@@ -244,7 +244,7 @@ def test_python_m_mape_is_the_console_script(here: Path, arguments: tuple[str, .
 
 def test_help_answers_without_the_heavy_imports() -> None:
     code = (
-        "import sys; from adapters.cli.main import main; main(['--help'])\n"
+        "import sys; from mapek import main; main(['--help'])\n"
         "heavy = {'numpy', 'numba', 'gymnasium', 'pydantic', 'scipy', 'matplotlib'}\n"
         "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
     )
@@ -316,7 +316,7 @@ def test_a_package_of_another_project_with_our_name_is_told_by_its_place(tmp_pat
     (tmp_path / "knowledge" / "__init__.py").write_text("")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", "import sys; from adapters.cli.main import main; sys.exit(main(['list']))"],
+        [sys.executable, "-c", "import sys; from mapek import main; sys.exit(main(['list']))"],
         env=environment, cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 1

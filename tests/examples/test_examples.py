@@ -20,6 +20,7 @@ from adapters.results import read_episodes
 from adapters.systems import make_system
 from knowledge import from_json
 from mape import load, run_trial
+from mape.config_files import find_config
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -53,7 +54,7 @@ def test_the_readme_shows_the_file_itself_in_at_most_20_lines_of_code(name):
 def test_a_rule_of_ones_own_is_compiled_with_the_rest_and_gives_the_hash_of_python(here):
     compiled, plain = (
         _typed(f"{line} -v -q --no-figures --out results/{name}", here)
-        for line, name in zip(_lines("mapek run examples/own_rule.toml"), ("compiled", "plain"), strict=True)
+        for line, name in zip(_lines("mapek run own_rule"), ("compiled", "plain"), strict=True)
     )
     assert "own_rule: whole stretches of passes are compiled" in compiled
     assert "own_rule: nothing is compiled, because the engine is python" in plain
@@ -68,16 +69,16 @@ def test_the_readme_shows_a_part_of_the_rule_of_ones_own_and_how_it_is_checked(h
     (shown,) = (code for code in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL) if "QuietRule" in code)
     assert shown in text
     assert len([line for line in shown.splitlines() if line.strip()]) <= 24
-    (line,) = re.findall(r"`(mapek check examples\S+:\S+)`", README)
+    (line,) = re.findall(r"`(mapek check \S+:Ewma)`", README)
     said = _typed(line, here)
     assert "ok      has a rule that does what its methods do, in Python and compiled" in said
-    (line,) = re.findall(r"`(mapek check examples\S+\.toml [^`]*)`", README)
+    (line,) = re.findall(r"`(mapek check \S+ --profile [^`]*)`", README)
     assert "ok      has rules that equal its steps, bit for bit" in _typed(line, here)
 
 
 def test_a_subclass_whose_base_has_a_rule_is_made_in_python_as_the_readme_says(here):
-    options = "-v -q --no-figures --set episodes=3 --set plan=examples.swap_planner:Gentle --out results/gentle"
-    said = _typed(f"mapek run examples/traffic.toml {options}", here)
+    options = "-v -q --no-figures --set episodes=3 --set plan=swap_planner:Gentle --out results/gentle"
+    said = _typed(f"mapek run traffic {options}", here)
     assert "traffic: only episodes are compiled, because planner Gentle declares no rule" in said
 
 
@@ -105,7 +106,7 @@ def test_a_toy_text_is_itself_by_default_and_its_table_with_a_profile(name):
 
 @pytest.mark.parametrize("name", ["frozen_lake", "cliff_walking", "taxi"])
 def test_a_toy_text_is_learned_with_the_seed_of_its_config(name, here):
-    _typed(f"mapek run examples/{name}.toml --profile tabulated -q --no-figures --out results/{name}", here)
+    _typed(f"mapek run {name} --profile tabulated -q --no-figures --out results/{name}", here)
     returns = read_episodes(here / "results" / name / f"episodes-{name}.npz")["return"][0]
     assert returns[-100:].mean() > returns[:100].mean()
 
@@ -121,7 +122,7 @@ def test_every_command_of_the_readme_is_understood(command):
     words = shlex.split(command)[1:]
     chosen = parser().parse_args(words)
     assert chosen.command == words[0]
-    assert not hasattr(chosen, "config") or (ROOT / chosen.config).exists()
+    assert not hasattr(chosen, "config") or find_config(chosen.config) in set((ROOT / "examples").iterdir())
 
 
 def test_a_detector_of_ones_own_is_found_from_the_command_line_in_its_folder(tmp_path):
@@ -172,7 +173,7 @@ def alone():
 
 @pytest.fixture(scope="module")
 def goals(here):
-    (command,) = _lines("mapek up examples/gridworld_goals.toml")
+    (command,) = _lines("mapek up gridworld_goals")
     _typed(f"{command} -q --no-figures", here)
     return here / "results" / "goals"
 
@@ -277,7 +278,7 @@ def test_the_example_of_swaps_makes_three_and_the_readme_shows_its_first(here):
     (shown,) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
     assert shown.splitlines()[1:] == text.split("[[swap]]")[1].strip().splitlines()[1:]
 
-    said = _typed("mapek run examples/swaps.toml -q --no-figures --out results/swaps", here)
+    said = _typed("mapek run swaps -q --no-figures --out results/swaps", here)
     assert re.findall(r"^pass (\d+): (\S+) is now (\S+)", said, flags=re.MULTILINE) == [
         ("450", "plan", "morphin"), ("700", "monitor", "two_window"), ("1000", "learner", "expected_sarsa"),
     ]  # fmt: skip
@@ -287,17 +288,17 @@ def test_the_example_of_swaps_makes_three_and_the_readme_shows_its_first(here):
 
 
 def test_the_example_of_many_loops_has_four_that_differ(here):
-    _typed("mapek run examples/many_loops.toml -q --no-figures --out results/loops", here)
+    _typed("mapek run many_loops -q --no-figures --out results/loops", here)
     trials = json.loads((here / "results" / "loops" / "result.json").read_bytes())["trials"]
     assert len({one["log_sha256"] for one in trials}) == len(trials) == 4
 
 
 def test_the_example_that_runs_freely_waits_for_no_plan_and_logs_how_old_each_was(here):
-    (line,) = _lines("mapek up examples/free_running.toml")
+    (line,) = _lines("mapek up free_running")
     _typed(f"{line} --set episodes=400 -q --no-figures --out results/free", here)
     with contextlib.closing(sqlite3.connect(here / "results" / "free" / "log.sqlite")) as log:
         seen = [from_json(body) for (body,) in log.execute("SELECT body FROM records WHERE stage = 0 ORDER BY pass")]
     assert [one.pass_no for one in seen] == [*range(1, 401)]
     assert all(one.age >= 1 for one in seen)
     assert seen[-1].plan > 0  # plans come while it runs, and are taken
-    assert "free-running needs processes" in _typed("mapek run examples/free_running.toml", here, code=2)
+    assert "free-running needs processes" in _typed("mapek run free_running", here, code=2)

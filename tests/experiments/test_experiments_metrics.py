@@ -209,9 +209,9 @@ def test_the_shortest_path_is_that_of_the_actions_that_are_there(corridor: Gymna
 
 
 def test_the_shortest_path_of_the_jump_experiment_falls_from_16_to_5() -> None:
-    from adapters.experiments.runner import experiment_config
     from mape.config import load
+    from mape.config_files import shipped
 
-    system = make_system(load(experiment_config("jump")).system)
+    system = make_system(load(shipped()["jump"]).system)
 
     assert (shortest_path(system, 300), shortest_path(system, 301)) == (16, 5)

@@ -11,8 +11,8 @@ import pytest
 
 from adapters.cli.main import main
 from adapters.experiments import paper
-from adapters.experiments.runner import experiment_config
 from mape.config import load
+from mape.config_files import shipped
 
 SMALL = ("--workers", "1", "--no-figures")
 
@@ -27,7 +27,7 @@ def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], *arguments: object) 
 def test_compare_prints_the_paired_interval_effect_and_p_and_keeps_all_in_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    goals = experiment_config("gridworld_goals")
+    goals = shipped()["gridworld_goals"]
     said, found = run(
         tmp_path, capsys, "compare", goals, "--trials", 5, "--set", "episodes=40", "--agents", "morphin,q_learning"
     )
@@ -49,7 +49,7 @@ def test_compare_prints_the_paired_interval_effect_and_p_and_keeps_all_in_json(
 
 
 def test_the_goals_example_has_the_agents_that_the_claims_are_about() -> None:
-    goals = experiment_config("gridworld_goals")
+    goals = shipped()["gridworld_goals"]
     plain, fixed = (load(goals, agent=agent) for agent in ("q_learning_alpha_09", "fixed_alpha_09"))
     tuned, morphin = load(goals, agent="q_learning"), load(goals, agent="morphin")
 
