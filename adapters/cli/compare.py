@@ -172,7 +172,10 @@ def _print_independent(
         lines.append((agent, *_difference(found, exact), *ends))
     _say_table(chosen, lines, (14, 24, 13, 10, 17))
     reasons = "; ".join(dict.fromkeys(pairings[agent].reason for agent in against))
-    say(chosen, f"\nThese trials are no pairs: {reasons}. Interval and Welch's t take the trials as independent samples.")
+    say(
+        chosen,
+        f"\nThese trials are no pairs: {reasons}. Interval and Welch's t take the trials as independent samples.",
+    )
 
 
 def _difference(found: Comparison, exact: float) -> tuple[str, str]:
