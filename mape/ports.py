@@ -7,6 +7,7 @@ A detector, analyzer, schedule or planner may also have
 - `state_format`, a name such as ``"page_hinkley/1"`` of what its `state` gives: a part that takes its place in a
   running loop and has the same one takes over its state. A planner that keeps its schedule in an attribute `schedule`,
   and asks it anew at each plan, can be given another one;
+- `threshold`, of a detector: the number that its statistic is held against, or None; figures draw it beside;
 - `quiet`, a `QuietRule`: where all parts declare one, and the system offers its rules, a stretch of passes in which
   nothing changes is one compiled call (`mape.stretch`).
 """

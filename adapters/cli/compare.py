@@ -64,7 +64,9 @@ def execute(chosen: argparse.Namespace) -> int:
         if not chosen.no_figures:
             from adapters.experiments.pictures import pictures_of_compare
 
-            figures = pictures_of_compare(folder, returns, {a: rows[a]["total_return"]["interval"] for a in rows})
+            intervals = {agent: row["total_return"]["interval"] for agent, row in rows.items()}
+            differences = {agent: found.interval for agent, found in against.items()}
+            figures = pictures_of_compare(folder, returns, intervals, differences)
         finish(chosen, folder, {"first": first, "agents": rows}, figures)
     return 0
 

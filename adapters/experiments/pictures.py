@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,19 +12,22 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from adapters.experiments import paper
 from adapters.experiments.metrics import convergence as stages_of
 from adapters.experiments.runner import drifts_of
 from adapters.figures.comparison import Compared, comparison
 from adapters.figures.convergence import convergence
-from adapters.figures.internal_dynamics import internal_dynamics
+from adapters.figures.files import save
+from adapters.figures.internal_dynamics import Watch, internal_dynamics
 from adapters.figures.learning_curve import learning_curve
 from adapters.figures.q_heatmaps import Panel, q_heatmaps
-from adapters.figures.style import save
 from adapters.results import RunFolder
 from adapters.results.files import cannot_write
 from adapters.systems import make_system
 from mape import registry
 from mape.config import Config
+from mape.parts import config_at, make
+from mape.trials import combined_hash
 
 NAMES = {
     "morphin": "MORPHIN",
@@ -47,7 +51,7 @@ GRID = "mapek/Gridworld-v0"
 def pictures_of_run(folder: RunFolder, agent: str) -> list[Path]:
     """Draw the learning curve, the internal dynamics where steps were traced, and Q where the system is a grid."""
     config = folder.configs[agent]
-    made = _put(folder, _curve(folder, (agent,), window=50), "learning_curve")
+    made = _put(folder, _curve(folder, (agent,)), "learning_curve")
     if (steps := folder.trace(agent)) is not None and len(steps):
         made += _put(folder, _dynamics(folder, agent, steps), "internal_dynamics")
     if _is_grid(config):
@@ -59,7 +63,12 @@ def pictures_of_table1(folder: RunFolder) -> list[Path]:
     """Draw the internal dynamics of trial 0, both agents' Q, and convergence per stage."""
     drifts, names = drifts_of(folder.configs["morphin"]), _names(folder.configs)
     found = {names[a]: stages_of(folder.episodes(a, "q_change")["q_change"], drifts) for a in folder.configs}
-    made = _put(folder, convergence(found), "convergence")
+    printed = {}
+    for agent in folder.configs:  # the paper prints the first stages only
+        means = [None if stage is None else stage.mean for stage in paper.TABLE1_STAGES[agent]]
+        missing = len(found[names[agent]]) - len(means)
+        printed[names[agent]] = means[:missing] if missing < 0 else means + [None] * missing
+    made = _put(folder, convergence(found, printed), "convergence")
     made += _put(folder, _heatmaps(folder, tuple(folder.configs)), "q_heatmaps")
     steps = folder.trace("morphin")
     if steps is not None:
@@ -71,39 +80,60 @@ def pictures_of_jump(folder: RunFolder) -> list[Path]:
     """Draw the agents' Q with the jumps, and the steps per episode."""
     made = _put(folder, _heatmaps(folder, tuple(folder.configs)), "q_heatmaps")
     names, config = _names(folder.configs), folder.configs["morphin"]
-    jump_from, window = config.system.options.get("jump_from"), min(20, config.episodes)
+    jump_from = config.system.options.get("jump_from")
     events = [int(jump_from)] if jump_from is not None else []
     steps = {names[agent]: folder.episodes(agent, "steps")["steps"].astype(float) for agent in folder.configs}
-    ylabel = f"steps per episode (mean of {window})" if window > 1 else "steps per episode"
-    figure = learning_curve(steps, drifts=events, detections={}, window=window, ylabel=ylabel)
+    figure = learning_curve(steps, drifts=events, detections={}, ylabel="steps per episode")
     return made + _put(folder, figure, "steps")
 
 
 def pictures_of_traffic(folder: RunFolder) -> list[Path]:
     """Draw the learning curves with drifts and detections."""
-    return _put(folder, _curve(folder, tuple(folder.configs), window=500), "learning_curve")
+    return _put(folder, _curve(folder, tuple(folder.configs)), "learning_curve")
 
 
 def pictures_of_compare(
-    folder: RunFolder, returns: Mapping[str, npt.NDArray[Any]], intervals: Mapping[str, Any]
+    folder: RunFolder,
+    returns: Mapping[str, npt.NDArray[Any]],
+    intervals: Mapping[str, Any],
+    differences: Mapping[str, Any] | None,
 ) -> list[Path]:
-    """Draw each agent's totals and the learning curves."""
+    """Draw each agent's totals, their differences to the first within trials, and the learning curves.
+
+    `intervals` are those of the means, by agent, and `differences` those of the differences, None where trials of the
+    same number are no pairs.
+    """
     names = _names(folder.configs)
     table = {names[agent]: Compared(values, intervals[agent]) for agent, values in returns.items()}
     xlabel = f"total return of a {_unit(folder)} (units of reward)"
-    made = _put(folder, comparison(table, xlabel=xlabel), "comparison")
-    episodes = min(config.episodes for config in folder.configs.values())
-    return made + _put(
-        folder, _curve(folder, tuple(folder.configs), window=max(1, min(500, episodes // 20))), "learning_curve"
-    )
+    paired = None if differences is None else {names[agent]: interval for agent, interval in differences.items()}
+    made = _put(folder, comparison(table, xlabel=xlabel, differences=paired), "comparison")
+    return made + _put(folder, _curve(folder, tuple(folder.configs)), "learning_curve")
 
 
 def _put(folder: RunFolder, figure: Figure, name: str) -> list[Path]:
     target = folder.path / "figures"
     try:
-        return save(figure, target, name)
+        return save(figure, target, name, title=_title(folder, name), about=_about(folder))
     except OSError as error:
         raise cannot_write(target, error) from error
+
+
+def _title(folder: RunFolder, name: str) -> str:
+    named = list(dict.fromkeys(config.name for config in folder.configs.values()))
+    return f"{name.replace('_', ' ')} of {', '.join(named)}"
+
+
+def _about(folder: RunFolder) -> str:
+    """Return what a file of a figure says of its run: enough to find the config, and the log, that it was drawn of."""
+    told = []
+    for agent, config in folder.configs.items():
+        results = folder.finished(agent).values()
+        log = "" if config.execute.mode == "free" else f", log {combined_hash(r.log_sha256 for r in results)}"
+        told.append(f"{agent}: config {hashlib.sha256(config.to_json().encode()).hexdigest()}{log}")
+    first = next(iter(folder.configs.values()))
+    counted = f"{first.trials:,} trial{'s' * (first.trials > 1)} of {first.episodes:,} episodes, seed {first.seed}"
+    return "; ".join([counted, *told])
 
 
 def _names(configs: Mapping[str, Config]) -> dict[str, str]:
@@ -136,7 +166,7 @@ def _is_grid(config: Config) -> bool:
     return config.system.id.rpartition(":")[2] == GRID  # the module that registers it may stand in front
 
 
-def _curve(folder: RunFolder, agents: tuple[str, ...], window: int) -> Figure:
+def _curve(folder: RunFolder, agents: tuple[str, ...]) -> Figure:
     names = _names(folder.configs)
     curves, detections = {}, {}
     for agent in agents:
@@ -144,31 +174,48 @@ def _curve(folder: RunFolder, agents: tuple[str, ...], window: int) -> Figure:
         curves[names[agent]] = columns["return"]
         if folder.configs[agent].monitor.detectors:
             detections[names[agent]] = (np.nonzero(columns["alarm"])[1] + 1).tolist()
-    window = min(window, max(folder.configs[agent].episodes for agent in agents))
     return learning_curve(
         curves,
         drifts={names[agent]: drifts_of(folder.configs[agent]) for agent in agents},
         detections=detections,
-        window=window,
-        ylabel=f"return (mean of {window} episodes)" if window > 1 else "return",
+        ylabel="return",
         unit=_unit(folder),
     )
 
 
 def _dynamics(folder: RunFolder, agent: str, steps: npt.NDArray[np.void]) -> Figure:
-    columns = folder.episodes(agent, "episode", "epsilon", "return", "alarm")
+    columns = folder.episodes(agent, "episode", "epsilon", "return")
     first = {name: values[0] for name, values in columns.items()}
-    alarms = first["episode"][first["alarm"]].tolist()
-    drifts = drifts_of(folder.configs[agent])
     spans = (int(steps["episode"][0]), int(steps["episode"][-1]))
     inside = (first["episode"] >= spans[0]) & (first["episode"] <= spans[1])
+    readings = folder.readings(agent)
     return internal_dynamics(
         steps,
         {name: first[name][inside] for name in ("episode", "epsilon", "return")},
-        alarms=[a for a in alarms if spans[0] <= a <= spans[1]],
-        drifts=[d for d in drifts if spans[0] <= d <= spans[1]],
+        alarms=readings["pass"][readings["alarm"].any(axis=1)].tolist(),
+        drifts=[d for d in drifts_of(folder.configs[agent]) if spans[0] <= d <= spans[1]],
+        watches=_watches(folder.configs[agent], readings),
         title=f"{_names(folder.configs)[agent]}, {folder.configs[agent].unit_name(0, 0)}",
     )
+
+
+def _watches(config: Config, readings: Mapping[str, npt.NDArray[Any]]) -> list[Watch]:
+    """Return what each detector read, held against the threshold of the one that read it."""
+    numbers = readings["pass"]
+    firsts = [swap.pass_no for swap in config.swap if swap.pass_no <= numbers[-1]]
+    thresholds = np.full(readings["statistic"].shape, np.nan)
+    names: list[dict[tuple[str, str], None]] = [{} for _ in config.monitor.detectors]  # in the order of their swaps
+    for number in sorted({int(numbers[0]), *(n for n in firsts if n > numbers[0])}):
+        for place, spec in enumerate(config_at(config, number).monitor.detectors):
+            # A detector of somebody else's may have none; it exposes what it likes.
+            threshold = getattr(make("detector", spec), "threshold", None)
+            thresholds[numbers >= number, place] = np.nan if threshold is None else threshold
+            names[place][spec.name.rpartition(":")[2], spec.signal] = None
+    found = []
+    for place, detectors in enumerate(names):
+        who, what = (", ".join(dict.fromkeys(one)) for one in zip(*detectors, strict=True))
+        found.append(Watch(who, what, readings["statistic"][:, place], thresholds[:, place]))
+    return found
 
 
 def _heatmaps(folder: RunFolder, agents: tuple[str, ...]) -> Figure:

@@ -2,14 +2,15 @@
 
 from adapters.figures.comparison import Compared, comparison
 from adapters.figures.convergence import convergence
-from adapters.figures.internal_dynamics import internal_dynamics
+from adapters.figures.files import save
+from adapters.figures.internal_dynamics import Watch, internal_dynamics
 from adapters.figures.learning_curve import learning_curve
 from adapters.figures.q_heatmaps import Panel, q_heatmaps
-from adapters.figures.style import save
 
 __all__ = [
     "Compared",
     "Panel",
+    "Watch",
     "comparison",
     "convergence",
     "internal_dynamics",

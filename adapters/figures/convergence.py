@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
@@ -17,6 +18,20 @@ from adapters.figures.arrays import Ints
 
 BOX_FROM = 5
 """A box needs at least as many trials; fewer are drawn as dots alone."""
+
+UPRIGHT = 0.24
+"""Inches of room from which on the texts of two neighbours do not touch."""
+
+MEAN: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markersize": 3.6,
+    "markerfacecolor": "white",
+    "markeredgecolor": style.INK,
+    "markeredgewidth": 0.8,
+    "gid": "mean",
+}
+PRINTED: dict[str, Any] = MEAN | {"marker": "D", "markerfacecolor": "none", "markersize": 5.0, "gid": "printed mean"}
 
 
 class ConvergedStage(Protocol):
@@ -33,16 +48,20 @@ class ConvergedStage(Protocol):
         ...
 
 
-def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
+def convergence(
+    stages: Mapping[str, Sequence[ConvergedStage]], printed: Mapping[str, Sequence[float | None]] | None = None
+) -> Figure:
     """Draw per stage and agent the episodes in which trials converged, and the share that did.
 
-    Above: a dot per converged trial, a box from the first to the third quartile with the median, and whiskers from the
-    5th to the 95th percentile; "none" where no trial converged. Below: the share of all trials.
+    Above: a dot per converged trial, a box from the first to the third quartile with the median, whiskers from the 5th
+    to the 95th percentile, and the mean; "none" where no trial converged. Below: the share of all trials.
 
     Parameters
     ----------
     stages
         Agent's name -> its stages, in order; the same number of them for every agent.
+    printed
+        Agent's name -> the mean of each stage that a paper prints, to be held against; None where it prints none.
 
     Returns
     -------
@@ -51,7 +70,8 @@ def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
     Raises
     ------
     ValueError
-        There is no agent or no stage, agents have different numbers of stages, or more trials converged than there are.
+        There is no agent or no stage, agents have different numbers of stages, more trials converged than there are, or
+        `printed` is of other agents or stages.
     """
     arrays.some("stages", stages)
     data = {name: _checked(name, list(found)) for name, found in stages.items()}
@@ -61,6 +81,7 @@ def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
             raise ValueError(
                 f"stages[{name!r}] has {len(found)} stages and the first agent has {n_stages}; give as many"
             )
+    told = _printed(printed or {}, data, n_stages)
 
     figure = style.new_figure(style.PAGE if n_stages * len(data) > 8 else style.COLUMN, 3.3)
     above, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [3.0, 1.15], "hspace": 0.0})
@@ -75,12 +96,16 @@ def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
         shade = style.colour(i)
         for stage, (converged, trials) in enumerate(found):
             x = stage + (i - (len(data) - 1) / 2) * pitch
-            _share(below, x, pitch, len(converged) / trials, shade, name, slot)
+            _share(below, x, pitch, len(converged) / trials, i, name, slot)
             if len(converged):
                 _distribution(above, x, pitch, converged, shade)
             else:
                 empty.append((x, shade))
-    above.set_ylim(0.0, 1.06 * max((float(c.max()) for f in data.values() for c, _ in f if len(c)), default=1.0))
+            if (mean := told[name][stage]) is not None:
+                above.plot([x - 0.16 * pitch if len(converged) >= BOX_FROM else x], [mean], **PRINTED, zorder=3.5)
+    highest = [float(c.max()) for f in data.values() for c, _ in f if len(c)]
+    highest += [mean for means in told.values() for mean in means if mean is not None]
+    above.set_ylim(0.0, 1.06 * max(highest, default=1.0))
     for x, shade in empty:
         style.write(
             above,
@@ -100,12 +125,13 @@ def convergence(stages: Mapping[str, Sequence[ConvergedStage]]) -> Figure:
     above.tick_params(axis="x", length=0.0)
     below.set_xlim(-0.5, n_stages - 0.5)
     below.set_xticks(range(n_stages), [str(stage + 1) for stage in range(n_stages)])
-    below.set_ylim(0.0, 1.32)
+    below.set_ylim(0.0, 1.32 if slot > UPRIGHT else 1.6)
     below.set_yticks([0.0, 1.0], ["0 %", "100 %"])
-    entries: list[tuple[Any, str]] = [
-        (Patch(facecolor=style.colour(i), edgecolor="none"), name)
-        for i, name in enumerate(style.short_names(data).values())
-    ]
+    entries: list[tuple[Any, str]] = [(_swatch(i), name) for i, name in enumerate(style.short_names(data).values())]
+    if any(len(converged) >= BOX_FROM for found in data.values() for converged, _ in found):
+        entries.append((Line2D([], [], **MEAN), "mean"))
+    if any(mean is not None for means in told.values() for mean in means):
+        entries.append((Line2D([], [], **PRINTED), "mean in the paper"))
     style.legend(
         figure,
         entries,
@@ -129,6 +155,23 @@ def _checked(name: str, found: list[ConvergedStage]) -> list[tuple[Ints, int]]:
             )
         checked.append((converged, trials))
     return checked
+
+
+def _printed(
+    printed: Mapping[str, Sequence[float | None]], data: Mapping[str, object], n_stages: int
+) -> dict[str, list[float | None]]:
+    told: dict[str, list[float | None]] = {name: [None] * n_stages for name in data}
+    for name, means in printed.items():
+        if name not in data:
+            raise ValueError(f"printed names {name!r}, which has no stages; the agents are {', '.join(data)}")
+        if len(means) != n_stages:
+            raise ValueError(f"printed[{name!r}] has {len(means)} stages and the run has {n_stages}; give as many")
+        told[name] = [None if m is None else float(arrays.floats(f"printed[{name!r}]", [m], 1)[0]) for m in means]
+    return told
+
+
+def _swatch(index: int) -> Patch:
+    return Patch(facecolor=style.colour(index), edgecolor="white", linewidth=0.0, hatch=style.hatch(index))
 
 
 def _distribution(axes: Axes, x: float, pitch: float, converged: Ints, shade: str) -> None:
@@ -162,10 +205,21 @@ def _distribution(axes: Axes, x: float, pitch: float, converged: Ints, shade: st
             medianprops={"color": shade, "linewidth": 2.0, "solid_capstyle": "butt"},
             zorder=2.5,
         )
+        axes.plot([x - 0.16 * pitch], [converged.mean()], **MEAN, zorder=3.0)
 
 
-def _share(axes: Axes, x: float, pitch: float, share: float, shade: str, name: str, slot: float) -> None:
-    axes.bar([x], [share], width=0.72 * pitch, color=shade, linewidth=0.0, zorder=2.0, gid=f"share of {name}")
+def _share(axes: Axes, x: float, pitch: float, share: float, index: int, name: str, slot: float) -> None:
+    (bar,) = axes.bar(
+        [x],
+        [share],
+        width=0.72 * pitch,
+        color=style.colour(index),
+        edgecolor="white",
+        linewidth=0.0,
+        zorder=2.0,
+        gid=f"share of {name}",
+    )
+    bar.set_hatch(style.hatch(index))
     # Never 0 % for some, nor 100 % for all but a few.
     percent = 100.0 * share
     if 0.0 < percent < 1.0:
@@ -181,5 +235,6 @@ def _share(axes: Axes, x: float, pitch: float, share: float, shade: str, name: s
         f"{text} %" if slot > 0.33 else text,
         ha="center",
         va="bottom",
-        fontsize=7.0 if slot > 0.24 else 6.0,
+        fontsize=7.0 if slot > UPRIGHT else 6.0,
+        rotation=0.0 if slot > UPRIGHT else 90.0,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,27 @@ from adapters.figures import arrays, style
 from adapters.figures.arrays import Floats, Ints
 
 GREEDY, EXPLORATORY = style.COLOURS[0], style.COLOURS[4]
+THRESHOLD = style.COLOURS[1]
 SLICES = 100
+WATCH = 1.0
+"""Height of a detector's panel, in inches."""
 ALPHA = "\N{GREEK SMALL LETTER ALPHA}"
+
+
+class Watch(NamedTuple):
+    """What one detector read.
+
+    Attributes
+    ----------
+    detector, signal : what it is called, and what it watches.
+    statistic : what it saw at the end of each episode of the trace, shape (episodes,); NaN where it exposed nothing.
+    threshold : what the statistic was held against, in the same shape; NaN where that is not known.
+    """
+
+    detector: str
+    signal: str
+    statistic: npt.ArrayLike
+    threshold: npt.ArrayLike
 
 
 def internal_dynamics(
@@ -26,13 +45,15 @@ def internal_dynamics(
     *,
     alarms: Sequence[int],
     drifts: Sequence[int],
+    watches: Sequence[Watch] = (),
     title: str = "",
 ) -> Figure:
-    """Draw return, Q of the chosen pairs, epsilon and alpha* over the learning steps of one trial.
+    """Draw return, statistics of detectors, Q of the chosen pairs, epsilon and alpha* over one trial's learning steps.
 
     The axis counts learning steps, not episodes: the episodes in which an agent adapts are its longest, and an axis of
     episodes would squeeze just those. Episode numbers stand on top. A drift is marked before the first step of its
-    episode, an alarm after the last of its own.
+    episode, an alarm after the last of its own. What is one number of an episode, as its return and the statistic at
+    its end, is drawn over its steps.
 
     Parameters
     ----------
@@ -47,12 +68,14 @@ def internal_dynamics(
         Episodes at whose end a detector alarmed.
     drifts
         Episodes from which a new regime held.
+    watches
+        What detectors read, a panel for each: its statistic, and dotted what that is held against.
     title
         Text above the figure.
 
     Returns
     -------
-    A figure of the width of a page; the dots are rasterised in its PDF.
+    A figure of the width of a page, higher with each detector; the dots are rasterised in its PDF.
 
     Raises
     ------
@@ -76,30 +99,39 @@ def internal_dynamics(
         [a - first + 1 for a in arrays.integers("alarms", alarms, empty=True).tolist() if first <= a <= last]
     ]
 
-    figure = style.new_figure(style.PAGE, 5.2)
+    read = [_checked(i, watch, last - first + 1) for i, watch in enumerate(watches)]
+    ylabels = ["return"]
+    ylabels += [f"{style.shorten(watch.detector, 15)}\n{style.shorten(watch.signal, 15)}" for watch in watches]
+    ylabels += ["Q(s, a)\nof the chosen pair", "ε", f"{ALPHA}*"]
+    heights = [1.1, *(WATCH for _ in watches), 2.4, 0.8, 1.1]
+    figure = style.new_figure(style.PAGE, 5.2 + WATCH * len(watches))
     panels: list[Axes] = list(
-        figure.subplots(4, 1, sharex=True, gridspec_kw={"height_ratios": [1.1, 2.4, 0.8, 1.1], "hspace": 0.0})
+        figure.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights, "hspace": 0.0})
     )
+    returns, *watched, values, rates, alphas = panels
     figure.align_ylabels(panels)
     below = "learning step" if first == 1 else f"learning step since the start of episode {first}"
-    for axes, ylabel in zip(panels, ("return", "Q(s, a)\nof the chosen pair", "ε", f"{ALPHA}*"), strict=True):
-        style.dress(axes, ylabel=ylabel, xlabel=below if axes is panels[-1] else "")
+    for axes, ylabel in zip(panels, ylabels, strict=True):
+        style.dress(axes, ylabel=ylabel, xlabel=below if axes is alphas else "")
         style.mark_drifts(axes, drift_x)
         style.mark_alarms(axes, alarm_x)
         axes.yaxis.set_major_formatter(style.PlainTicks())
         axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
-    panels[0].set_xlim(begins[0], begins[-1])
-    panels[-1].xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    returns.set_xlim(begins[0], begins[-1])
+    alphas.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
 
-    panels[0].stairs(table["return"][rows], begins, baseline=None, color=style.INK, linewidth=0.6)
+    returns.stairs(table["return"][rows], begins, baseline=None, color=style.INK, linewidth=0.6)
+    for axes, (statistic, threshold) in zip(watched, read, strict=True):
+        axes.yaxis.label.set_fontsize(style.SMALL)
+        _watch(axes, statistic, threshold, begins)
     exploratory = trace["exploratory"] != 0
-    _dots(panels[1], x, trace["q"], exploratory)
-    panels[2].stairs(table["epsilon"][rows], begins, baseline=None, color=style.INK, linewidth=0.9)
-    panels[2].set_ylim(-0.06, 1.06)
-    panels[2].set_yticks([0.0, 0.5, 1.0])
-    _dots(panels[3], x, trace["alpha"], exploratory)
+    _dots(values, x, trace["q"], exploratory)
+    rates.stairs(table["epsilon"][rows], begins, baseline=None, color=style.INK, linewidth=0.9)
+    rates.set_ylim(-0.06, 1.06)
+    rates.set_yticks([0.0, 0.5, 1.0])
+    _dots(alphas, x, trace["alpha"], exploratory)
 
-    _number_episodes(panels[0], shown[:-1], begins, drift_x)
+    _number_episodes(returns, shown[:-1], begins, drift_x)
     if title:
         figure.suptitle(title, fontsize=style.NORMAL, family=style.FAMILY, color=style.INK, parse_math=False)
     entries: list[tuple[Any, str]] = [
@@ -110,8 +142,34 @@ def internal_dynamics(
         entries.append((style.drift_handle(), "true drift"))
     if len(alarm_x):
         entries.append((style.alarm_handle(), "alarm"))
+    if any(not np.isnan(threshold).all() for _, threshold in read):
+        entries.append((Line2D([], [], color=THRESHOLD, linewidth=1.0, linestyle=":"), "threshold"))
     style.legend(figure, entries, loc="outside lower center", ncols=len(entries))
     return figure
+
+
+def _checked(number: int, watch: Watch, episodes: int) -> tuple[Floats, Floats]:
+    found = []
+    for name, given in (("statistic", watch.statistic), ("threshold", watch.threshold)):
+        values = np.asarray(given, dtype=np.float64)
+        if values.shape != (episodes,) or np.isinf(values).any():
+            raise ValueError(
+                f"watches[{number}].{name} has shape {values.shape}; give a finite number, or NaN, for each of the "
+                f"trace's {episodes} episodes"
+            )
+        found.append(values)
+    return found[0], found[1]
+
+
+def _watch(axes: Axes, statistic: Floats, threshold: Floats, begins: Floats) -> None:
+    if np.isnan(statistic).all():
+        middle = {"transform": axes.transAxes, "ha": "center", "va": "center"}
+        style.write(axes, 0.5, 0.5, "exposes no statistic", color=style.MUTED, **middle)
+        axes.set_yticks([])
+        return
+    axes.stairs(statistic, begins, baseline=None, color=style.INK, linewidth=0.8, gid="statistic")
+    axes.stairs(threshold, begins, baseline=None, color=THRESHOLD, linewidth=1.0, linestyle=":", gid="threshold")
+    axes.margins(y=0.1)
 
 
 def _rows_of(numbers: Ints, first: int, last: int) -> Ints:

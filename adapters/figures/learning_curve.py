@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,17 +19,29 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, StrMethodFormatter
 from adapters.figures import arrays, style
 from adapters.figures.arrays import Floats, Ints
 
-POINTS = 1500
-"""Points drawn per curve: three for each pixel of a page at 72 dpi."""
+POINTS = 600
+"""Blocks drawn per curve, at most but for those that drifts cut short: one for each pixel of a page at 72 dpi."""
+
+FEW = 40
+"""Blocks of a curve of few trials, at least: so its blocks are short beside a run."""
+
+EPISODES = 100
+"""Episodes of all trials together that make a mean steady enough to be read."""
 
 TICKS = 400
 """Ticks that have room side by side in the strip of alarms."""
 
 
 class Curve(NamedTuple):
-    """A mean over trials and its 95 % interval at some episodes; `low` and `high` equal `mean` for a single trial."""
+    """Means of blocks of episodes over trials, with their 95 % intervals.
 
-    episodes: Ints
+    Attributes
+    ----------
+    edges : first episode of each block, and the one after the last; shape (blocks + 1,).
+    mean, low, high : shape (blocks,); all equal for a single trial, which has no interval.
+    """
+
+    edges: Ints
     mean: Floats
     low: Floats
     high: Floats
@@ -39,15 +52,17 @@ def learning_curve(
     *,
     drifts: Sequence[int] | Mapping[str, Sequence[int]],
     detections: Mapping[str, Sequence[int]],
-    window: int,
     ylabel: str,
     unit: str = "trial",
+    block: int | None = None,
 ) -> Figure:
-    """Draw the trailing mean of each agent's returns, averaged over trials, with a 95 % band and its alarms.
+    """Draw the mean of each agent's returns over trials, with a 95 % band and its alarms.
 
-    The value at episode e is the mean over episodes e - window + 1 to e, of the same regime. The band is Student's t
-    interval of the mean over trials. An alarm is a tick in the strip below, the darker the more trials have one there.
-    A drift that all agents meet is a band behind all; another is one behind the alarms of the agent that meets it.
+    Each number is drawn over the very episodes that it is the mean of: one where there are many trials, else a block
+    of neighbours, none of which reaches over a drift. So nothing is late, and a fall is as steep as it was. Of a single
+    trial of a single agent each episode is a dot beside. The band is Student's t interval of the mean over trials. An
+    alarm is a tick in the strip below, the darker the more trials have one there. A drift that all agents meet is a
+    band behind all; another is one behind the alarms of the agent that meets it.
 
     Parameters
     ----------
@@ -59,12 +74,12 @@ def learning_curve(
     detections
         Agent's name -> episodes of the alarms of all its trials, in any order; an agent without a detector is left
         out, and with no agent there is no strip.
-    window
-        Number of episodes, at least 1.
     ylabel
-        Name and unit of what is drawn.
+        Name and unit of the returns; of blocks, the label says how long they are.
     unit
         What a row of returns is of, a trial or a loop of one.
+    block
+        Episodes of a block, at most; None for `block_of` the curves.
 
     Returns
     -------
@@ -77,9 +92,9 @@ def learning_curve(
         agent without a curve, or `drifts` leaves one out.
     """
     arrays.some("curves", curves)
-    window = arrays.count("window", window)
     data = {name: arrays.floats(f"curves[{name!r}]", values, 2, gaps=True) for name, values in curves.items()}
     last = max(values.shape[1] for values in data.values())
+    block = block_of(list(data.values())) if block is None else arrays.count("block", block)
     drift_at = _drifts(drifts, data)
     shared = set.intersection(*(set(at.tolist()) for at in drift_at.values()))
     alarms: dict[str, Ints] = {}
@@ -98,11 +113,13 @@ def learning_curve(
         axes, below = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": [2.1, strip], "hspace": 0.0})
     else:
         axes = below = figure.subplots()
+    if block > 1:
+        ylabel += f"\n(means of up to {block:,} episodes)"
     style.dress(axes, ylabel=ylabel)
     style.dress(below, xlabel="episode", **({"grid": "none"} if alarms else {"ylabel": ylabel}))
-    shown = [float(drift) for drift in sorted(shared) if drift <= last]
+    shown = [drift - 0.5 for drift in sorted(shared) if drift <= last]  # between two episodes
     style.mark_drifts(axes, shown)
-    axes.set_xlim(*((1.0, last) if last > 1 else (0.5, 1.5)))
+    axes.set_xlim(0.5, last + 0.5)
     axes.yaxis.set_major_formatter(style.PlainTicks())
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
@@ -112,21 +129,14 @@ def learning_curve(
     names = style.short_names(data)
     entries: list[tuple[Any, str]] = []
     for i, (name, values) in enumerate(data.items()):
-        curve = summarise(values, window, drift_at[name])
-        shade = style.colour(i)
-        axes.fill_between(curve.episodes, curve.low, curve.high, color=shade, alpha=0.22, linewidth=0.0, zorder=2.0)
-        at = curve.episodes.astype(np.float64)
-        if len(at) == 1:  # neither a band nor a line: a bar with a dot at the mean, the agents' side by side
-            at = at + 0.6 * ((i + 0.5) / len(data) - 0.5)
-            axes.vlines(at, curve.low, curve.high, colors=shade, alpha=0.22, linewidths=6.0, zorder=2.0)
-        (line,) = axes.plot(at, curve.mean, color=shade, linewidth=1.2, linestyle=style.dashes(i), zorder=2.5)
-        if len(at) == 1:
-            line.set(marker="o", markersize=5.0)
+        line = _curve(axes, summarise(values, block, drift_at[name]), i, len(data))
         line.set_gid(name)
         entries.append((line, names[name]))
+    if block > 1 and len(data) == 1 and values.shape[0] == 1:
+        entries.append((_episodes(axes, values[0]), "one episode"))
     if max(values.shape[0] for values in data.values()) > 1:
         entries.append((Patch(color=style.INK, alpha=0.22, linewidth=0.0), "95 % interval of the mean"))
-    own = {name: [float(d) for d in drift_at[name].tolist() if d not in shared and d <= last] for name in alarms}
+    own = {name: [d - 0.5 for d in drift_at[name].tolist() if d not in shared and d <= last] for name in alarms}
     if shown or any(own.values()):
         entries.append((style.drift_handle(), "true drift"))
     if alarms:
@@ -147,46 +157,93 @@ def _drifts(drifts: Sequence[int] | Mapping[str, Sequence[int]], data: Mapping[s
     return {name: arrays.integers(f"drifts[{name!r}]", at, empty=True) for name, at in drifts.items()}
 
 
-def summarise(values: Floats, window: int, keep: Sequence[int] | Ints = ()) -> Curve:
-    """Take trailing means, and their mean and 95 % interval over trials, at no more episodes than can be seen.
+def block_of(values: Sequence[Floats]) -> int:
+    """Return how many episodes share a mean, where curves of these shapes are drawn: as few as can be read.
+
+    >>> [block_of([np.zeros(shape)]) for shape in ((200, 900), (30, 900), (1, 900), (200, 10_000), (1, 50))]
+    [1, 4, 22, 17, 1]
+    """
+    trials, length = min(len(v) for v in values), int(max(v.shape[1] for v in values))
+    return max(-(-length // POINTS), min(-(-EPISODES // trials), length // FEW), 1)
+
+
+def summarise(values: Floats, block: int, breaks: Sequence[int] | Ints = ()) -> Curve:
+    """Cut episodes into blocks of at most `block`, and take the mean and 95 % interval over trials of each.
 
     Parameters
     ----------
     values
         Shape (trials, episodes); NaN, of which no mean takes notice, for what was not recorded. Where a trial has
-        nothing else in a window there is no interval, and where all have nothing, no mean.
-    window
-        Number of episodes.
-    keep
-        Episodes at which the curve breaks: these and the ones before are among the episodes returned, and no window
-        reaches back over them; else a fall would look like a slope as long as the window.
+        nothing else in a block there is no interval, and where all have nothing, no mean.
+    block
+        Number of episodes; what lies between two breaks is cut into equal blocks, as far as that goes.
+    breaks
+        Episodes at which a block begins, whatever the one before it holds.
 
     Examples
     --------
-    >>> summarise(np.array([[0.0, 2.0, 4.0]]), window=2).mean.tolist()
-    [0.0, 1.0, 3.0]
+    >>> summarise(np.array([[0.0, 2.0, 4.0, 9.0]]), block=2, breaks=[4])
+    Curve(edges=array([1, 3, 4, 5]), mean=array([1., 4., 9.]), low=array([1., 4., 9.]), high=array([1., 4., 9.]))
     """
     # Imported here: it takes longer than all the rest of this package, and only this needs it.
     from scipy.special import stdtrit
 
     trials, length = values.shape
-    spaced = np.linspace(1, length, min(length, POINTS)).round().astype(np.int64)
-    breaks = [e for k in keep for e in (int(k) - 1, int(k)) if 1 <= e <= length]
-    episodes = np.union1d(spaced, np.array(breaks, dtype=np.int64))
+    firsts = [1, *sorted({int(k) for k in breaks if 1 < k <= length}), length + 1]
+    cuts = [np.linspace(a, b, -(-(b - a) // block), endpoint=False) for a, b in itertools.pairwise(firsts)]
+    edges = np.concatenate([*cuts, [length + 1]]).astype(np.int64)
     recorded = ~np.isnan(values)
-    sums, counts = np.zeros((trials, length + 1)), np.zeros((trials, length + 1), np.int64)
-    np.cumsum(np.where(recorded, values, 0.0), axis=1, out=sums[:, 1:])
-    np.cumsum(recorded, axis=1, out=counts[:, 1:])
-    firsts = np.unique([1, *(k for k in (int(k) for k in keep) if 1 <= k <= length)])
-    begins = np.maximum(episodes - window, firsts[np.searchsorted(firsts, episodes, side="right") - 1] - 1)
+    sums = np.add.reduceat(np.where(recorded, values, 0.0), edges[:-1] - 1, axis=1)
     with np.errstate(invalid="ignore"):  # nothing by nothing is NaN
-        means = (sums[:, episodes] - sums[:, begins]) / (counts[:, episodes] - counts[:, begins])
+        means = sums / np.add.reduceat(recorded, edges[:-1] - 1, axis=1, dtype=np.int64)
         mean = np.nansum(means, axis=0) / (~np.isnan(means)).sum(axis=0)
     if trials == 1:
-        return Curve(episodes, mean, mean, mean)
+        return Curve(edges, mean, mean, mean)
     half = float(stdtrit(trials - 1, 0.975)) * means.std(axis=0, ddof=1) / np.sqrt(trials)
-    # No mean lies outside of what was seen, however wide Student's interval of few trials is.
-    return Curve(episodes, mean, np.maximum(mean - half, np.nanmin(values)), np.minimum(mean + half, np.nanmax(values)))
+    return Curve(edges, mean, mean - half, mean + half)
+
+
+def _curve(axes: Axes, curve: Curve, index: int, agents: int) -> Line2D:
+    """Draw the curve of the agent at `index`, each mean over its own episodes; return its line."""
+    shade, marker = style.colour(index), style.marker(index)
+    if len(curve.mean) == 1:  # neither a band nor a line: a bar with a dot at the mean, the agents' side by side
+        at = 1.0 + 0.6 * ((index + 0.5) / agents - 0.5)
+        axes.vlines([at], curve.low, curve.high, colors=shade, alpha=0.22, linewidths=6.0, zorder=2.0)
+        (line,) = axes.plot([at], curve.mean, color=shade, marker=marker or "o", markersize=5.0, zorder=2.5)
+        return line
+    edges = curve.edges - 0.5
+    marked: dict[str, Any] = {"marker": marker, "markersize": 4.0, "markevery": max(1, len(curve.mean) // 12)}
+    low, high, mean = (np.append(one, one[-1]) for one in (curve.low, curve.high, curve.mean))
+    axes.fill_between(edges, low, high, step="post", color=shade, alpha=0.22, linewidth=0.0, zorder=2.0)
+    (line,) = axes.plot(
+        edges,
+        mean,
+        drawstyle="steps-post",
+        color=shade,
+        linewidth=1.2,
+        linestyle=style.dashes(index),
+        zorder=2.5,
+        **({} if marker is None else marked),
+    )
+    return line
+
+
+def _episodes(axes: Axes, values: Floats) -> Line2D:
+    """Draw each episode of one trial, palely, beside the means of its blocks."""
+    (dots,) = axes.plot(
+        np.arange(1, len(values) + 1),
+        values,
+        linestyle="none",
+        marker="o",
+        markersize=1.8,
+        markeredgewidth=0.0,
+        color=style.MUTED,
+        alpha=0.45,
+        rasterized=True,
+        zorder=1.5,
+        gid="episodes",
+    )
+    return dots
 
 
 def _strip(

@@ -139,9 +139,11 @@ def q_heatmaps(
         greedy = np.where(known[i] & ~at_goal, tables[i][1][tables[i][0].argmax(axis=0)], -1)
         _arrows(axes, greedy, best[i], columns, norm)
         jumping = jumping or bool((greedy >= 4).any())
-    over = any((norm(b[k]) > 1.0).any() for b, k in zip(best, known, strict=True))
+    reached = norm(np.concatenate([b[k] for b, k in zip(best, known, strict=True)]))
+    beyond = (bool((reached < 0.0).any()), bool((reached > 1.0).any()))
+    extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[beyond]
     share = side / (high * columns / rows)
-    bar = _scale(figure, everything, across, None if flat else share, "max" if over else "neither", of)
+    bar = _scale(figure, everything, across, None if flat else share, extend, of)
     bar.long_axis.set_major_locator(MaxNLocator(5 if flat or high > 1.3 else 3))
     unseen = any((~k & ordinary).any() for k in known)
     _legend(figure, width > style.COLUMN, jumping, unseen, wall_cells, goal_cells, start_cell)

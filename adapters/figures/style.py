@@ -1,4 +1,4 @@
-"""One look for all figures, and the way they get to the disk.
+"""One look for all figures.
 
 Nothing here goes through `matplotlib.pyplot`: a figure belongs to whoever asked for it, so figures can be drawn in
 several threads. Text is plain Unicode, not mathtext, whose parser is shared between threads.
@@ -6,19 +6,12 @@ several threads. Text is plain Unicode, not mathtext, whose parser is shared bet
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
 import re
-import secrets
 import textwrap
-import threading
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
@@ -43,18 +36,19 @@ FAMILY = "DejaVu Sans"  # comes with matplotlib, so a figure has the same bytes 
 MINUS = "\N{MINUS SIGN}"
 INK, MUTED, GRID, BAND = "#222222", "#666666", "#e4e4e4", "#c4c4c4"
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette, which readers with any colour vision tell apart; without yellow, too pale for a line."""
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7800D8", "#603000")
+"""Okabe and Ito's palette without yellow, too pale for a line, and two more; told apart with any colour vision."""
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1.5, 1, 1.5)))
-"""Line styles, so that neighbours differ in greyscale too."""
+"""Line styles, so that neighbours differ in greyscale too; as many as have no divisor with the colours in common."""
+
+HATCHES = ("/", ".", "x", "-", "o", "|", "+")
+"""Of areas, which have no line style: none at first, and then the next one with each round through the colours."""
 
 ROWS = 3
 """Rows of a legend for which a figure has room."""
 
-PNG_DPI, RASTER_DPI = 200, 400
-
-_saving = threading.Lock()
+PNG_DPI = 200
 
 
 def colour(index: int) -> str:
@@ -73,6 +67,26 @@ def spread(count: int) -> npt.NDArray[np.float64]:
 def dashes(index: int) -> Any:
     """Return the line style of the agent at `index` of its figure."""
     return DASHES[index % len(DASHES)]
+
+
+def marker(index: int) -> tuple[int, int, int] | None:
+    """Return the marker of the agent at `index`: none before colour and line style come again, then a polygon.
+
+    >>> marker(35), marker(36), marker(72)
+    (None, (3, 0, 0), (4, 0, 0))
+    """
+    rounds = index // (len(COLOURS) * len(DASHES))
+    return (2 + rounds, 0, 0) if rounds else None
+
+
+def hatch(index: int) -> str:
+    """Return the hatch of the agent at `index`: another one, or a denser one, each time that its colour comes again.
+
+    >>> hatch(0), hatch(9), hatch(72)
+    ('', '///', '//////')
+    """
+    rounds = index // len(COLOURS) - 1
+    return "" if rounds < 0 else HATCHES[rounds % len(HATCHES)] * 3 * (1 + rounds // len(HATCHES))
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -261,77 +275,10 @@ def _verticals(
     return lines
 
 
-def number(value: float, resolution: float) -> str:
+def number(value: float, resolution: float, sign: str = "-") -> str:
     """Write a number as `adapters.experiments.decimals.number` does, with the minus sign of figures.
 
     >>> number(23348.123, 90.0), number(-340.26, 0.8)
     ('23,348', '−340.3')
     """
-    return decimals.number(value, resolution).replace("-", MINUS)
-
-
-def save(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as ``NAME.png`` (200 dpi) and ``NAME.pdf`` (vector, text as TrueType) into a folder.
-
-    Both are drawn and written beside their places before the first takes its name, so a full disk leaves what was
-    there before. The files hold no date: equal figures have equal bytes, for equal versions of matplotlib. The first
-    save fixes the layout; what is added to a figure later gets no room of its own.
-
-    Parameters
-    ----------
-    figure
-        What to write.
-    folder
-        Where to; made if missing.
-    name
-        Name of the files, without an ending.
-
-    Returns
-    -------
-    The two paths, PNG first.
-
-    Raises
-    ------
-    ValueError
-        The name is empty, begins with a dot or holds a path separator.
-    OSError
-        A file cannot be written; nothing half-written stays.
-    """
-    if not name or name.startswith(".") or any(sign in name for sign in "/\\\0"):
-        raise ValueError(f"name is {name!r}; give a file name without folder and ending, such as 'learning_curve'")
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
-    parts = [path.with_name(f".{path.name}.{secrets.token_hex(4)}.part") for path in paths]
-    try:
-        for part, data in zip(parts, _drawn(figure), strict=True):
-            with open(part, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-        for part, path in zip(parts, paths, strict=True):
-            os.replace(part, path)
-    finally:
-        for part in parts:
-            with contextlib.suppress(OSError):
-                part.unlink()
-    return paths
-
-
-def _drawn(figure: Figure) -> tuple[bytes, bytes]:
-    """Draw a figure as PNG and as PDF."""
-    png, pdf = io.BytesIO(), io.BytesIO()
-    # The type of a PDF's fonts can be set for the process only; so one figure is drawn at a time, and it is set back.
-    with _saving:
-        before = matplotlib.rcParams["pdf.fonttype"]
-        matplotlib.rcParams["pdf.fonttype"] = 42
-        try:
-            if figure.get_layout_engine() is not None:
-                # Each layout starts from the last one and moves things by a hair; so it is made once, for both files.
-                figure.draw_without_rendering()
-                figure.set_layout_engine("none")
-            figure.savefig(png, format="png", dpi=PNG_DPI)
-            figure.savefig(pdf, format="pdf", dpi=RASTER_DPI, metadata={"CreationDate": None})
-        finally:
-            matplotlib.rcParams["pdf.fonttype"] = before
-    return png.getvalue(), pdf.getvalue()
+    return decimals.number(value, resolution, sign).replace("-", MINUS)

@@ -22,6 +22,8 @@ from mape.loop import Loop
 from mape.trials import TrialResult, run_trial
 
 TRACE_DTYPE = np.dtype([("episode", "<u4"), *[(name, "<f8") for name in TRACE_COLUMNS]])
+READINGS = ("pass", "statistic", "alarm")
+"""What is kept of the log's rows of traced episodes: what each detector read."""
 
 
 def run_chunk(
@@ -58,6 +60,7 @@ def run_chunk(
     config = from_table(json.loads(config_json))
     results: list[TrialResult] = []
     arrays: dict[str, npt.NDArray[Any]] = {}
+    readings: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in READINGS}
     digest = hashlib.sha256()
     whole_units = digest.copy()
     failure: MapekError | None = None
@@ -70,6 +73,10 @@ def run_chunk(
                 block = from_rows(trial, turn, rows).tobytes()
                 digest.update(block)
                 file.write(block)
+                if trace is not None and trial == turn == 0:
+                    inside = (rows["pass"] >= trace[0]) & (rows["pass"] <= trace[1])
+                    for name in READINGS:
+                        readings[name].append(rows[name][inside])
                 if on_rows is not None:
                     on_rows(rows)
 
@@ -98,6 +105,7 @@ def run_chunk(
             arrays[f"actions_{unit}"] = np.array(table.actions, dtype=np.int64)
             if unit == 0 and trace is not None:
                 arrays["trace"] = np.concatenate(steps) if steps else np.empty(0, TRACE_DTYPE)
+                arrays |= {f"readings_{name}": np.concatenate(parts) for name, parts in readings.items()}
     write_heads(path, results, arrays, len(results) * config.episodes, whole_units.hexdigest())
     if failure is not None:
         raise failure
@@ -116,6 +124,9 @@ def write_heads(
     )
 
 
+_TRACED = ("trace", *(f"readings_{name}" for name in READINGS))
+
+
 def _packed(arrays: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
     """Put the Q-tables of all units one behind the other: an archive of a few entries is written and read at once."""
     units = [int(name.removeprefix("q_")) for name in arrays if name.startswith("q_")]
@@ -126,11 +137,11 @@ def _packed(arrays: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
         "values": np.concatenate([np.empty(0), *[table.ravel() for table in tables]]),
         "actions": np.concatenate([np.empty(0, np.int64), *[arrays[f"actions_{unit}"] for unit in units]]),
     }
-    return packed | {name: arrays[name] for name in ("trace",) if name in arrays}
+    return packed | {name: arrays[name] for name in _TRACED if name in arrays}
 
 
 def _unpacked(packed: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-    arrays: dict[str, npt.NDArray[Any]] = {name: packed[name] for name in ("trace",) if name in packed}
+    arrays: dict[str, npt.NDArray[Any]] = {name: packed[name] for name in _TRACED if name in packed}
     value = row = 0
     for unit, (rows, states) in zip(packed["units"].tolist(), packed["shapes"].tolist(), strict=True):
         arrays[f"q_{unit}"] = packed["values"][value : value + rows * states].reshape(rows, states)

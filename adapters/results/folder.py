@@ -8,6 +8,7 @@ chunks/               finished trials, as they come; gone when the run is comple
 episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
 q_tables-AGENT.npz    Q-tables at the end: q_UNIT (actions x states), actions_UNIT (ids of the rows)
 trace-AGENT.npy       steps of the traced episodes of unit 0
+readings-AGENT.npz    what its detectors read at the end of each of them: pass, statistic, alarm (episodes x detectors)
 result.json           what the command found, with the hashes; its presence says that the run is complete
 figures/              PNG and PDF
 
@@ -31,7 +32,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.chunk import read_arrays, read_chunk, remove_parts
+from adapters.results.chunk import READINGS, read_arrays, read_chunk, remove_parts
 from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
 from adapters.results.own_code import other_versions, own_modules
 from adapters.results.table import read_episodes, read_last, write_npz
@@ -124,6 +125,9 @@ def assemble(folder: str, agent: str, rows: int, loops: int) -> None:
     if trace is not None:
         with whole(path / f"trace-{agent}.npy") as file:
             np.save(file, trace, allow_pickle=False)
+        readings = {name: arrays.pop(f"readings_{name}") for name in READINGS}
+        with whole(path / f"readings-{agent}.npz") as file:
+            np.savez(file, allow_pickle=False, **readings)
     with whole(path / f"q_tables-{agent}.npz") as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -295,6 +299,11 @@ class RunFolder:
         """Return the traced steps of trial 0, or None where nothing was traced."""
         path = self.path / f"trace-{agent}.npy"
         return np.load(path, allow_pickle=False) if path.exists() else None
+
+    def readings(self, agent: str) -> dict[str, npt.NDArray[Any]]:
+        """Return what detectors read in the traced episodes of trial 0: `pass`, `statistic` and `alarm`, by column."""
+        path = self.path / f"readings-{agent}.npz"
+        return read_npz(path, made_again(path))
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write the result, and remove the chunks that are now in the tables."""

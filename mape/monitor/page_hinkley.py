@@ -83,6 +83,11 @@ class PageHinkley:
         """How far the cumulative sum stands above its minimum."""
         return self._state[2] - self._state[3]
 
+    @property
+    def threshold(self) -> float:
+        """What the statistic is held against."""
+        return self.config.threshold
+
     def update(self, x: float) -> bool:
         """Take one value; say whether the test alarms."""
         return page_hinkley_alarm(self._state, self._params, x)[0]

@@ -116,6 +116,11 @@ class TwoWindow:
         z = self._state[0]
         return None if math.isnan(z) else abs(z)
 
+    @property
+    def threshold(self) -> float:
+        """What the statistic is held against."""
+        return self.config.threshold
+
     def update(self, x: float) -> bool:
         """Take one value; say whether the test alarms."""
         return two_window_alarm(self._state, self._params, x)[0]

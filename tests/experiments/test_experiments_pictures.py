@@ -1,4 +1,4 @@
-"""What agents are called in figures, and what is said of loops, of few episodes, and of a grid by another name."""
+"""What agents are called in figures, and what is said of loops, and of a grid by another name."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -55,7 +55,7 @@ def ran(tmp_path: Path) -> Iterator[Run]:
 
 def compared(folder: RunFolder) -> list[Path]:
     returns = {agent: folder.episodes(agent, "return")["return"].sum(axis=1) for agent in folder.configs}
-    return pictures.pictures_of_compare(folder, returns, dict.fromkeys(returns))
+    return pictures.pictures_of_compare(folder, returns, dict.fromkeys(returns), dict.fromkeys([*returns][1:]))
 
 
 def names(ran: Run, drawn: dict[str, Any], configs: dict[str, Config]) -> dict[str, str]:
@@ -111,24 +111,6 @@ def test_figures_say_trial_or_loop_as_it_is(ran: Run, drawn: dict[str, Any], loo
     pictures.pictures_of_run(folder, "morphin")
     assert drawn["q_heatmaps"]["of"] == of
     assert drawn["internal_dynamics"]["title"] == f"MORPHIN, {of}"
-
-
-@pytest.mark.parametrize(
-    ("episodes", "returns", "steps"),
-    [
-        (1, "return", "steps per episode"),
-        (5, "return (mean of 5 episodes)", "steps per episode (mean of 5)"),
-        (60, "return (mean of 60 episodes)", "steps per episode (mean of 20)"),
-    ],
-)
-def test_no_mean_is_of_more_episodes_than_there_are(
-    ran: Run, drawn: dict[str, Any], episodes: int, returns: str, steps: str
-) -> None:
-    folder = ran({"morphin": grid(episodes=episodes)})
-    pictures.pictures_of_traffic(folder)
-    assert drawn["learning_curve"]["ylabel"] == returns
-    pictures.pictures_of_jump(folder)
-    assert drawn["learning_curve"]["ylabel"] == steps
 
 
 def test_a_grid_is_drawn_too_where_the_module_that_registers_it_stands_in_front(ran: Run) -> None:

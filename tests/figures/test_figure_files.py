@@ -39,7 +39,7 @@ def figures():
             [Panel("a", values, tuple(range(8)), 0)], rows=2, columns=2, walls=[(1, 0)], goals=[(0, 0)], start=(1, 1)
         ),
         "curve": learning_curve(
-            {"a": np.arange(20.0).reshape(2, 10)}, drifts=[5], detections={"a": [6]}, window=3, ylabel="return"
+            {"a": np.arange(20.0).reshape(2, 10)}, drifts=[5], detections={"a": [6]}, ylabel="return"
         ),
         "convergence": convergence({"a": [Stage()]}),
         "comparison": comparison({"a": Compared([1.0, 2.0], (1.2, 1.8))}, xlabel="steps"),

@@ -1,10 +1,13 @@
 """What stands in a figure is what was given: the artists say so."""
 
-import time
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
 
 from adapters.figures import (
     Compared,
@@ -14,9 +17,9 @@ from adapters.figures import (
     internal_dynamics,
     learning_curve,
     q_heatmaps,
+    save,
 )
-from adapters.figures.learning_curve import summarise
-from adapters.figures.style import save
+from adapters.figures.learning_curve import block_of, summarise
 
 
 class Stage(NamedTuple):
@@ -209,6 +212,14 @@ def test_goals_and_states_never_updated_do_not_set_the_scale():
     assert images[0].get_array().mask.sum() == 6
 
 
+@pytest.mark.parametrize(("goal", "extend"), [(5.0, "neither"), (-90.0, "min"), (90.0, "max")])
+def test_the_scale_says_that_something_lies_beyond_it(goal, extend):
+    values = table()
+    values[:, 0], values[0, 4], values[0, 5] = goal, 3.0, 7.0
+    figure = heatmap(Panel("a", values, (0, 1, 2, 3), 1))
+    assert figure.axes[0].images[0].colorbar.extend == extend
+
+
 def test_walls_are_hatched_and_goals_and_start_marked():
     values = table()
     values[0, 4] = 1.0
@@ -254,43 +265,52 @@ def test_a_table_that_does_not_fit_the_grid_is_refused(panel, options, message):
 # learning curve
 
 
-def test_the_curve_is_the_trailing_mean_with_students_interval():
-    values = np.random.default_rng(1).normal(size=(3, 40))
-    curve = summarise(values, window=7)
-    means = np.array([values[:, max(0, e - 7) : e].mean(axis=1) for e in curve.episodes])
-    assert curve.episodes.tolist() == list(range(1, 41))
-    np.testing.assert_allclose(curve.mean, means.mean(axis=1), atol=1e-12)
-    half = 4.302652729911275 * means.std(axis=1, ddof=1) / np.sqrt(3)  # t of 2 degrees of freedom
-    mean = means.mean(axis=1)
-    np.testing.assert_allclose(curve.high, np.minimum(mean + half, values.max()), atol=1e-12)
-    np.testing.assert_allclose(curve.low, np.maximum(mean - half, values.min()), atol=1e-12)
+@given(st.data())
+def test_a_block_holds_the_mean_and_students_interval_of_its_own_episodes(data):
+    trials, length = data.draw(st.integers(2, 5)), data.draw(st.integers(1, 60))
+    block, breaks = data.draw(st.integers(1, 70)), data.draw(st.sets(st.integers(1, 80)))
+    values = np.random.default_rng(data.draw(st.integers(0, 9))).normal(size=(trials, length))
+    curve = summarise(values, block, sorted(breaks))
+    assert (curve.edges[0], curve.edges[-1]) == (1, length + 1)
+    assert {k for k in breaks if k <= length} <= set(curve.edges.tolist())
+    for k, (first, end) in enumerate(itertools.pairwise(curve.edges.tolist())):
+        assert 1 <= end - first <= block
+        means = values[:, first - 1 : end - 1].mean(axis=1)
+        half = stats.t.ppf(0.975, trials - 1) * means.std(ddof=1) / np.sqrt(trials)
+        np.testing.assert_allclose(curve.mean[k], means.mean(), atol=1e-12)
+        np.testing.assert_allclose([curve.low[k], curve.high[k]], means.mean() + np.array([-half, half]), atol=1e-12)
 
 
-def test_no_window_reaches_back_over_a_drift():
-    values = np.concatenate([np.full((2, 20), 5.0), np.full((2, 20), -5.0)], axis=1)
-    curve = summarise(values, window=10, keep=[21])
-    assert dict(zip(curve.episodes.tolist(), curve.mean.tolist(), strict=True))[20] == 5.0
-    assert set(curve.mean[curve.episodes > 20].tolist()) == {-5.0}
+def test_the_interval_of_few_trials_is_not_cut_and_has_room():
+    values = np.array([[1.0, 2.0, 1.0], [3.0, 2.0, 9.0]])
+    curve = summarise(values, 1)
+    assert curve.low.min() < values.min()
+    assert curve.high.max() > values.max()
+    figure = learning_curve({"a": values}, drifts=[], detections={}, ylabel="return", block=1)
+    low, high = figure.axes[0].get_ylim()
+    assert low < curve.low.min()
+    assert high > curve.high.max()
 
 
-def test_a_long_curve_is_thinned_but_keeps_its_ends_and_the_drift():
-    curve = summarise(np.zeros((2, 10_001)), 500, keep=[3001])
-    assert len(curve.episodes) <= 1502
-    assert {1, 3000, 3001, 10_001} <= set(curve.episodes.tolist())
+def test_a_long_curve_has_no_more_points_than_can_be_seen_and_keeps_its_drift():
+    values = np.zeros((200, 10_001))
+    curve = summarise(values, block_of([values]), breaks=[3001])
+    assert len(curve.mean) <= 602
+    assert {1, 3001, 10_002} <= set(curve.edges.tolist())
 
 
 def test_episodes_without_a_record_count_in_no_mean():
     nan = np.nan
-    curve = summarise(np.array([[1.0, nan, 3.0, nan, nan, 6.0]]), window=2)
-    np.testing.assert_array_equal(curve.mean, [1.0, 1.0, 3.0, 3.0, nan, 6.0])
-    curve = summarise(np.array([[1.0, nan, nan, 4.0], [3.0, 5.0, nan, 6.0]]), window=1)
+    curve = summarise(np.array([[1.0, nan, 3.0, 5.0, nan, nan]]), 2)
+    np.testing.assert_array_equal(curve.mean, [1.0, 4.0, nan])
+    curve = summarise(np.array([[1.0, nan, nan, 4.0], [3.0, 5.0, nan, 6.0]]), 1)
     np.testing.assert_array_equal(curve.mean, [2.0, 5.0, nan, 5.0])
     np.testing.assert_array_equal(np.isnan(curve.low), [False, True, True, False])
 
 
 def test_a_run_with_dropped_episodes_is_drawn_and_one_without_any_record_is_not(tmp_path):
     def drawn(values):
-        return learning_curve({"a": values}, drifts=[], detections={}, window=2, ylabel="return")
+        return learning_curve({"a": values}, drifts=[], detections={}, ylabel="return")
 
     values = np.arange(40.0).reshape(2, 20)
     values[0, 3:9] = values[1, 5:12] = np.nan
@@ -303,8 +323,8 @@ def test_a_run_with_dropped_episodes_is_drawn_and_one_without_any_record_is_not(
 
 def test_drifts_and_alarms_stand_at_their_episodes():
     data = {"morphin": np.zeros((2, 50)), "plain": np.ones((2, 50))}
-    figure = learning_curve(data, drifts=[21, 90], detections={"morphin": [23, 23, 40]}, window=5, ylabel="return")
-    assert [xs(lines) for lines in by_gid(figure, "drift")] == [[21.0], [21.0]]
+    figure = learning_curve(data, drifts=[21, 90], detections={"morphin": [23, 23, 40]}, ylabel="return")
+    assert [xs(lines) for lines in by_gid(figure, "drift")] == [[20.5], [20.5]], "between two episodes"
     (ticks,) = by_gid(figure, "alarms of morphin")
     assert xs(ticks) == [23.0, 40.0]
     opacity = ticks.get_colors()[:, 3]
@@ -315,21 +335,14 @@ def test_drifts_and_alarms_stand_at_their_episodes():
 
 def test_without_detectors_there_is_no_strip_and_without_alarms_an_empty_row():
     data = {"_a": np.zeros((1, 5))}
-    assert len(learning_curve(data, drifts=[], detections={}, window=2, ylabel="return").axes) == 1
-    quiet = learning_curve(data, drifts=[], detections={"_a": []}, window=2, ylabel="return")
+    assert len(learning_curve(data, drifts=[], detections={}, ylabel="return").axes) == 1
+    quiet = learning_curve(data, drifts=[], detections={"_a": []}, ylabel="return")
     assert len(quiet.axes) == 2
     assert {"_a", "0.0 per trial"} <= set(texts(quiet))
 
 
-def test_two_hundred_trials_of_ten_thousand_episodes_take_no_more_than_seconds():
-    values = np.zeros((200, 10_001))
-    began = time.process_time()
-    learning_curve({"a": values}, drifts=[3001], detections={}, window=500, ylabel="return").draw_without_rendering()
-    assert time.process_time() - began < 5.0
-
-
 @pytest.mark.parametrize(
-    ("curves", "detections", "window", "message"),
+    ("curves", "detections", "block", "message"),
     [
         ({}, {}, 5, "curves is empty"),
         ({"a": np.zeros((0, 5))}, {}, 5, "is empty, shape"),
@@ -337,12 +350,12 @@ def test_two_hundred_trials_of_ten_thousand_episodes_take_no_more_than_seconds()
         ({"a": [[1.0, np.inf]]}, {}, 5, "holds inf"),
         ({"a": np.zeros((1, 5))}, {"b": []}, 5, "detections names 'b'"),
         ({"a": np.zeros((1, 5))}, {"a": [6]}, 5, "holds episode 6"),
-        ({"a": np.zeros((1, 5))}, {}, 0, "window is 0"),
+        ({"a": np.zeros((1, 5))}, {}, 0, "block is 0"),
     ],
 )
-def test_curves_that_cannot_be_drawn_are_refused(curves, detections, window, message):
+def test_curves_that_cannot_be_drawn_are_refused(curves, detections, block, message):
     with pytest.raises(ValueError, match=message):
-        learning_curve(curves, drifts=[], detections=detections, window=window, ylabel="return")
+        learning_curve(curves, drifts=[], detections=detections, block=block, ylabel="return")
 
 
 # convergence
@@ -365,6 +378,22 @@ def test_a_stage_in_which_no_trial_converged_says_so():
 def test_a_share_is_not_rounded_to_none_or_all():
     figure = convergence({"a": [Stage(np.arange(1, 1000), 1000), Stage(np.array([4]), 1000)]})
     assert {">99 %", "<1 %"} <= set(texts(figure))
+
+
+def test_the_means_that_a_paper_prints_stand_beside_the_ones_found():
+    found = {
+        "a": [Stage(np.arange(10, 20), 10), Stage(np.array([], dtype=int), 10)],
+        "b": [Stage(np.array([3]), 9)] * 2,
+    }
+    figure = convergence(found, {"a": [700.0, None], "b": [30.0, 40.0]})
+    at = [(round(float(m.get_xdata()[0])), float(m.get_ydata()[0])) for m in by_gid(figure.axes[0], "printed mean")]
+    assert at == [(0, 700.0), (0, 30.0), (1, 40.0)]
+    assert [float(m.get_ydata()[0]) for m in by_gid(figure.axes[0], "mean")] == [14.5]
+    assert figure.axes[0].get_ylim()[1] > 700.0
+    assert {"mean", "mean in the paper"} <= set(texts(figure))
+    for wrong in ({"c": [1.0, 1.0]}, {"a": [1.0]}, {"a": [np.nan, 1.0]}):
+        with pytest.raises(ValueError, match="printed"):
+            convergence(found, wrong)
 
 
 def test_that_nothing_ever_converged_can_be_drawn():
@@ -403,6 +432,25 @@ def test_a_comparison_draws_means_intervals_and_trials_from_top_to_bottom():
     axes = figure.axes[0]
     assert axes.get_ylim() == (1.5, -0.5)
     assert {"2.0  [1.5, 2.5]", "7.0", "b_$", "learning steps"} <= set(texts(figure))
+
+
+def test_differences_are_those_within_trials_and_held_against_none():
+    table = {"a": Compared([1.0, 20.0], None), "b": Compared([2.0, 22.0], None), "c": Compared([0.0, 25.0], None)}
+    figure = comparison(table, xlabel="return", differences={"b": (1.0, 2.0), "c": None})
+    above, below = figure.axes
+    assert [np.sort(t.get_xdata()).tolist() for t in by_gid(below, "trials")] == [[1.0, 2.0], [-1.0, 5.0]]
+    assert [float(m.get_xdata()[0]) for m in by_gid(below, "mean")] == [1.5, 2.0]
+    assert [m.get_color() for m in by_gid(below, "mean")] == [m.get_color() for m in by_gid(above, "mean")][1:]
+    assert [list(i.get_xdata()) for i in by_gid(below, "interval")] == [[1.0, 2.0]]
+    low, high = below.get_xlim()
+    assert low < 0.0 < high
+    assert {"+1.5  [+1.0, +2.0]", "difference to a, return"} <= set(texts(figure))
+    for wrong, message in (({"b": None}, "give those of b, c"), ({"b": (2.0, 1.0), "c": None}, "low not above high")):
+        with pytest.raises(ValueError, match=message):
+            comparison(table, xlabel="return", differences=wrong)
+    uneven = {"a": Compared([1.0, 2.0], None), "b": Compared([1.0], None)}
+    with pytest.raises(ValueError, match="pairs"):
+        comparison(uneven, xlabel="return", differences={"b": None})
 
 
 def test_equal_numbers_can_be_compared():
