@@ -141,23 +141,23 @@ def each_completed(
     tasks: Iterable[tuple[Any, ...]],
     in_flight: int,
     *,
-    here: bool = False,
+    here: Callable[..., Any] | None = None,
 ) -> Iterator[Any]:
     """Submit `tasks` and yield results as they come, with at most `in_flight` of them submitted at a time.
 
-    What `work` raises is raised here, after the tasks that are running have ended; the others are not begun. Where
-    `here` is true, who asks for the next result works on a task too, as long as there is one, and does not just wait.
+    What `work` raises is raised here, after the tasks that are running have ended; the others are not begun. With
+    `here`, who asks for the next result does that with a task too, as long as there is one, and does not just wait.
     """
     waiting: set[Future[Any]] = set()
     pending = iter(tasks)
     try:
         while True:
             # Taken first: else the last tasks would all queue up for the others, with nobody at work here.
-            at_hand = next(pending, None) if here else None
+            at_hand = None if here is None else next(pending, None)
             while len(waiting) < in_flight and (task := next(pending, None)) is not None:
                 waiting.add(executor.submit(work, *task))
-            if at_hand is not None:
-                yield work(*at_hand)
+            if at_hand is not None and here is not None:
+                yield here(*at_hand)
             elif not waiting:
                 return
             done, waiting = wait(waiting, timeout=None if at_hand is None else 0.0, return_when=FIRST_COMPLETED)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import contextlib
+import functools
 import gc
 import json
 import os
@@ -16,11 +17,12 @@ from typing import Any
 
 from adapters import detectors
 from adapters.cli.main import OutputError
-from adapters.experiments.runner import announce_compilation, check
+from adapters.experiments.runner import Checked, announce_compilation, check
 from adapters.experiments.statistics import finite
 from adapters.results import RunFolder
 from adapters.results.files import cannot_write, try_whole, write_json
 from adapters.results.folder import default_path
+from adapters.systems.lending import Lender
 from mape.config import Config, load
 from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
@@ -90,6 +92,11 @@ def caution(configs: Iterable[Config]) -> None:
     """Say on standard error, once, what detectors say of the signals that they are to watch."""
     for sentence in dict.fromkeys(sentence for config in configs for sentence in cautions(config)):
         print(f"caution: {sentence}", file=sys.stderr)
+
+
+def looking(lend: Lender) -> Callable[[Config], Checked]:
+    """Return a check of configs that looks at the systems which `lend` lends afterwards."""
+    return functools.partial(check, lend=lend)
 
 
 def _looked_at(chosen: argparse.Namespace, trace: tuple[int, int] | None) -> str:

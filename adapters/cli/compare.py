@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
 from adapters.experiments.decimals import number, resolution
 from adapters.experiments.pairing import Pairing, pairing
 from adapters.experiments.runner import run_agents
 from adapters.experiments.statistics import Comparison, compare, holm, of_few, summary
+from adapters.systems.lending import Lender
 from mape.config import Config, overlays_of
 from mape.errors import ConfigError, UnknownName
 from mape.trials import combined_hash
@@ -26,8 +27,11 @@ def execute(chosen: argparse.Namespace) -> int:
     prepare()
     configs = _configs(chosen)
     first = next(iter(configs))
-    with open_folder(chosen, "compare", "compare", configs) as folder:
-        results = run_agents(configs, folder, workers=chosen.workers, quiet=chosen.quiet)
+    with (
+        Lender() as lend,
+        open_folder(chosen, "compare", "compare", configs, check=looking(lend)) as folder,
+    ):
+        results = run_agents(configs, folder, workers=chosen.workers, quiet=chosen.quiet, lend=lend)
         steps = {agent: np.array([r.total_steps for r in found], dtype=float) for agent, found in results.items()}
         returns = {agent: folder.episodes(agent, "return")["return"].sum(axis=1) for agent in configs}
         alarms = {agent: float(np.mean([len(r.alarms) for r in found])) for agent, found in results.items()}

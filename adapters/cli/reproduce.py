@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
 from adapters.experiments import paper
 from adapters.experiments.metrics import (
     Detection,
@@ -25,6 +25,7 @@ from adapters.experiments.runner import drifts_of, run_agents
 from adapters.experiments.statistics import Comparison, compare, of_few, summary
 from adapters.results import RunFolder
 from adapters.systems import make_system
+from adapters.systems.lending import Lender
 from mape.config import Config
 from mape.config_files import shipped
 from mape.errors import ConfigError
@@ -47,8 +48,12 @@ def execute(chosen: argparse.Namespace) -> int:
                 "trial several times; leave loops out, and give --trials N for more"
             )
     traced = None if chosen.no_figures or trace is None else (1, configs[agents[0]].episodes)
-    with open_folder(chosen, f"reproduce {chosen.experiment}", chosen.experiment, configs, traced) as folder:
-        results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet)
+    what = f"reproduce {chosen.experiment}"
+    with (
+        Lender() as lend,
+        open_folder(chosen, what, chosen.experiment, configs, traced, looking(lend)) as folder,
+    ):
+        results = run_agents(configs, folder, workers=chosen.workers, trace=traced, quiet=chosen.quiet, lend=lend)
         say(chosen)
         result = {"experiment": chosen.experiment, "profile": profile, "trials": configs[agents[0]].trials}
         if chosen.no_statistics:

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
 from adapters.cli.sentences import sentence
 from adapters.experiments.runner import run_agents
 from adapters.experiments.statistics import summary
+from adapters.systems.lending import Lender
 from knowledge import STAGES, Record
 from mape.config import Config
 from mape.errors import ConfigError
@@ -29,9 +30,18 @@ def execute(chosen: argparse.Namespace) -> int:
         if span is not None and span[1] > config.episodes:
             raise ConfigError(f"{option} {span[0]}:{span[1]} goes beyond the run's {config.episodes} episodes")
     watch = None if chosen.show is None else _shower(chosen, *chosen.show)
-    with open_folder(chosen, "run", config.name, {label: config}, chosen.trace) as folder:
+    with (
+        Lender() as lend,
+        open_folder(chosen, "run", config.name, {label: config}, chosen.trace, looking(lend)) as folder,
+    ):
         results = run_agents(
-            {label: config}, folder, workers=chosen.workers, trace=chosen.trace, quiet=chosen.quiet, prepare=watch
+            {label: config},
+            folder,
+            workers=chosen.workers,
+            trace=chosen.trace,
+            quiet=chosen.quiet,
+            prepare=watch,
+            lend=lend,
         )[label]
         result = as_json(config, results)
         report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))

@@ -25,9 +25,11 @@ from adapters.processes.supervise import Failed, Supervisor, command_of
 from adapters.results import RunFolder
 from adapters.roles import KNOWLEDGE, ROLES
 from adapters.stores import LOG_NAME, Swap
+from adapters.systems.declared import is_plant
 from knowledge import from_json
-from mape.config import Config
+from mape.config import Config, parts_of
 from mape.errors import ConfigError
+from mape.parts import make
 from mape.trials import TrialResult
 
 
@@ -107,6 +109,10 @@ def _own_endpoint(opened: contextlib.ExitStack) -> str:
 
 
 def _check(config: Config) -> object:
+    if is_plant(config.system):  # only Execute makes it, and tells what cannot be told without
+        for kind, _, spec in parts_of(config):
+            make(kind, spec)
+        return "what is compiled, Execute says: a plant is made by it alone"
     # What a free-running system is made of can be looked at as if it waited.
     still = config.execute.model_copy(update={"mode": "lockstep", "rate": None})
     return check(config.model_copy(update={"execute": still}), in_processes=True)

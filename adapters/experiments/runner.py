@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import functools
 import gc
 import multiprocessing
 import multiprocessing.connection
@@ -22,6 +23,8 @@ from adapters.results import RunFolder
 from adapters.results.chunk import run_chunk
 from adapters.results.folder import assemble
 from adapters.systems import make_system
+from adapters.systems.declared import declared, is_plant
+from adapters.systems.lending import Lender
 from mape import compose
 from mape.config import Config
 from mape.errors import MapekError
@@ -88,6 +91,7 @@ def run_agents(
     trace: tuple[int, int] | None = None,
     quiet: bool = False,
     prepare: Callable[[Loop], object] | None = None,
+    lend: Lender | None = None,
 ) -> dict[str, list[TrialResult]]:
     """Run what is not finished yet, show how far it is, and make each agent's tables.
 
@@ -103,6 +107,8 @@ def run_agents(
         Episodes of unit 0, the first loop of trial 0, whose steps are kept.
     prepare
         Called with each loop before its first pass; then everything runs in this process.
+    lend
+        Makes the systems that this process drives: that which was looked at before is the first of them.
 
     Returns
     -------
@@ -115,12 +121,17 @@ def run_agents(
     MapekError
         A trial failed, or the disk is full.
     """
+    if lend is None:
+        with Lender() as lend:
+            return run_agents(
+                configs, folder, workers=workers, trace=trace, quiet=quiet, prepare=prepare, lend=lend
+            )
     most = workers or os.cpu_count() or 1
     seconds = 0.0
     finished = {agent: folder.finished(agent) for agent in configs}
     tasks: list[Task] = []
     for agent, config in configs.items():
-        checked = check(config)
+        checked = check(config, lend=lend)
         missing = [unit for unit in range(config.units) if unit not in finished[agent]]
         seconds += len(missing) * trial_seconds(config, checked)
         for first, count in chunks(missing, chunk_size(config, checked, most)):
@@ -136,10 +147,10 @@ def run_agents(
     ) as bar:  # fmt: skip
         try:
             if workers > 1 and prepare is None:
-                _run_in_workers(tasks, list(map(folder.assembly, configs)), workers, bar)
+                _run_in_workers(tasks, list(map(folder.assembly, configs)), workers, bar, lend)
             else:
                 for task in tasks:
-                    run_chunk(*task, on_rows=lambda rows: bar.update(len(rows)), prepare=prepare)
+                    run_chunk(*task, on_rows=lambda rows: bar.update(len(rows)), prepare=prepare, lend=lend)
                 for agent in configs:
                     folder.assemble(agent)
         except KeyboardInterrupt:
@@ -166,11 +177,11 @@ def trial_seconds(config: Config, checked: Checked) -> float:
     return TRIAL_SECONDS + config.episodes * max(one + checked.max_steps * step for one, step in costs)
 
 
-def check(config: Config, *, in_processes: bool = False) -> Checked:
+def check(config: Config, *, in_processes: bool = False, lend: Lender | None = None) -> Checked:
     """Make all that a config names, what it is to swap among it, and say what that tells about the cost of a trial.
 
     In this process first: what is wrong with a config is said at once, and the compiled code is in the cache before
-    several workers want it.
+    several workers want it. Nothing is done to the system.
 
     Parameters
     ----------
@@ -178,25 +189,27 @@ def check(config: Config, *, in_processes: bool = False) -> Checked:
         Of a run that waits for its plans.
     in_processes
         Whether each component is to be a process of its own: then episodes are all that can be compiled.
+    lend
+        Makes the system that is looked at, and lends it to whoever drives one next.
 
     Raises
     ------
     MapekError
         Something cannot be made or compiled.
     """
-    system = make_system(config.system)
-    try:
-        loop = Loop(config, system)
-        stages: list[Stage] = []
-        for first in sorted({1, *(swap.pass_no for swap in config.swap)}):
-            for _ in (swap for swap in config.swap if swap.pass_no == first):
-                loop.swap()
-            stage = _stage(loop, first, in_processes)
-            if not stages or stage[1:] != stages[-1][1:]:
-                stages.append(stage)
-        return Checked(tuple(stages), system.max_steps, loop.execute.q_table.values.nbytes)
-    finally:
-        system.close()
+    if lend is None:
+        with Lender() as lend:
+            return check(config, in_processes=in_processes, lend=lend)
+    system = lend.look(config.system)
+    loop = Loop(config, system)
+    stages: list[Stage] = []
+    for first in sorted({1, *(swap.pass_no for swap in config.swap)}):
+        for _ in (swap for swap in config.swap if swap.pass_no == first):
+            loop.swap()
+        stage = _stage(loop, first, in_processes)
+        if not stages or stage[1:] != stages[-1][1:]:
+            stages.append(stage)
+    return Checked(tuple(stages), system.max_steps, 8 * system.n_states * system.n_actions)
 
 
 def _stage(loop: Loop, first: int, in_processes: bool) -> Stage:
@@ -206,7 +219,9 @@ def _stage(loop: Loop, first: int, in_processes: bool) -> Stage:
     return Stage(first, "episodes" if loop.execute.compiled else "nothing", obstacles)
 
 
-def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], workers: int, bar: Any) -> None:
+def _run_in_workers(
+    tasks: list[Task], assemblies: list[tuple[Any, ...]], workers: int, bar: Any, lend: Lender
+) -> None:
     # This process is the first of the workers: it is there already, with all that is compiled. Spawn the others, never
     # fork: a forked process inherits threads' locks. And processes, not threads: what is not compiled of a trial takes
     # as long as what is, and holds the lock of the interpreter.
@@ -217,9 +232,11 @@ def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], worker
     try:
         with _Pool(others, mp_context=context, initializer=_start_worker) as pool:
             try:
-                for results in each_completed(pool, run_chunk, tasks, in_flight=2 * others, here=True):
+                for results in each_completed(
+                    pool, run_chunk, tasks, in_flight=2 * others, here=functools.partial(run_chunk, lend=lend)
+                ):
                     bar.update(sum(result.passes for result in results))
-                for _ in each_completed(pool, assemble, assemblies, in_flight=others, here=True):
+                for _ in each_completed(pool, assemble, assemblies, in_flight=others, here=assemble):
                     pass
             except BrokenProcessPool:
                 raise MapekError(
@@ -276,7 +293,13 @@ def announce_compilation() -> None:
 
 
 def drifts_of(config: Config) -> tuple[int, ...]:
-    """Return the episodes of a run of `config` from which a new regime holds, where its system knows them."""
-    system = make_system(config.system)
-    system.close()
-    return tuple(drift for drift in system.drifts if drift <= config.episodes)
+    """Return the episodes of a run of `config` from which a new regime holds, where its system knows them.
+
+    A plant is not made for that: its class may say.
+    """
+    drifts = declared(config.system, "drifts")
+    if not is_plant(config.system):
+        system = make_system(config.system)
+        system.close()
+        drifts = system.drifts
+    return tuple(drift for drift in drifts if drift <= config.episodes) if isinstance(drifts, tuple) else ()

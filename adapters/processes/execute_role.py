@@ -287,13 +287,13 @@ class FreeExecuteRole(ExecuteRole):
                 plans.update({plan.pass_no: plan for plan in found if isinstance(plan, ChangePlan)})
             at = min(plans, default=number + 1)
             if at <= number:
-                execute.adopt(fitting(plans.pop(at), execute.q_table.actions))
+                execute.adopt(fitting(plans.pop(at), _known(unit)))
 
     def _adopt(self, unit: Unit, record: Record) -> None:
         assert isinstance(record, ChangePlan)
         plan = unit.component.plan
         if plan is None or record.pass_no > plan.pass_no:
-            unit.component.adopt(fitting(record, unit.component.q_table.actions))
+            unit.component.adopt(fitting(record, _known(unit)))
         if record.pass_no >= self.config.episodes:
             self.finish(unit)
 
@@ -323,3 +323,9 @@ class FreeExecuteRole(ExecuteRole):
         if dropped is not None:  # what the dropped episodes taught is in no record
             state, table = unit.component.state()
             self.member.keep(State(loop=unit.loop, pass_no=record.pass_no, state=plain(state)), table)
+
+
+def _known(unit: Unit) -> tuple[int, ...]:
+    """Return the actions that have a row in the Q-table; none before there is a table."""
+    assert unit.knowledge is not None
+    return unit.knowledge.actions

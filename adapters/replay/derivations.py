@@ -218,13 +218,13 @@ class FedByLog:
 
     def _drive(self, execute: Execute, under: int) -> None:
         while self._plans and self._plans[0].pass_no <= under:
-            execute.adopt(fitting(self._plans.popleft(), execute.q_table.actions))
+            execute.adopt(fitting(self._plans.popleft(), self.knowledge.actions))
         execute.drive()
 
     def settle(self) -> None:
         """Put in force what was planned, as at the end of a run."""
         while self._execute is not None and self._plans and self.failure is None:
-            self._execute.adopt(fitting(self._plans.popleft(), self._execute.q_table.actions))
+            self._execute.adopt(fitting(self._plans.popleft(), self.knowledge.actions))
 
     def log_sha256(self) -> str | None:
         """Return the hash of what was made; None where the loop ran freely."""

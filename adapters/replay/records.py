@@ -13,6 +13,7 @@ from adapters.replay.derivations import Derivation, FedByLog, WholeLoop, with_sw
 from adapters.stores import LOG_NAME, Store
 from adapters.stores.ledger import differences, layout_from
 from adapters.systems import make_system
+from adapters.systems.declared import is_plant
 from knowledge import STAGES, Ack, ChangePlan, FreeLog, Observation, Record, RowLayout, from_json, to_json
 from mape.config import Config, from_table
 from mape.errors import ConfigError, PartError, ResultsError
@@ -157,7 +158,7 @@ class LogReplay:
 
     def _system(self, loop: int) -> Any:
         """Make the managed system, if the episodes of a loop can be driven again."""
-        if self.config.system.redrivable is False or (self.free and self.store.dropped(loop)):
+        if is_plant(self.config.system) or (self.free and self.store.dropped(loop)):
             return None
         system = make_system(self.config.system)
         if system.redrivable:

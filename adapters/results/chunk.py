@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
@@ -34,6 +35,7 @@ def run_chunk(
     trace: tuple[int, int] | None = None,
     on_rows: Any = None,
     prepare: Any = None,
+    lend: Lender | None = None,
 ) -> list[TrialResult]:
     """Run `count` units from number `first` and write ``STEM.rows``, ``STEM.npz`` and, last, ``STEM.json``.
 
@@ -49,6 +51,8 @@ def run_chunk(
         First and last episode whose steps are kept, of unit 0.
     on_rows, prepare
         Further listeners as `run_trial` takes them; only within one process.
+    lend
+        Makes the systems; only within one process.
 
     Raises
     ------
@@ -65,7 +69,8 @@ def run_chunk(
     whole_units = digest.copy()
     failure: MapekError | None = None
     path = Path(stem)
-    with whole(path.with_suffix(".rows")) as file, Lender() as lend:
+    with whole(path.with_suffix(".rows")) as file, ExitStack() as opened:
+        lend = opened.enter_context(Lender()) if lend is None else lend
         for unit in range(first, first + count):
             trial, turn = divmod(unit, config.loops)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 from typing import Any
 
 import gymnasium
@@ -19,7 +20,7 @@ from managed_systems.rules import available
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
-from mape.states import FAULTS
+from mape.states import FAULTS, told
 
 _RULES = tuple(name for name in vars(StepRules) if not name.startswith("_"))
 
@@ -85,6 +86,15 @@ def _own_rules(base: Any) -> StepRules | None:
     return rules if all(hasattr(rules, name) for name in _RULES) else None
 
 
+def _takes_nothing(method: Any) -> bool:
+    """Whether a method can be called without arguments; a `connect` that wants some is another thing than ours."""
+    try:
+        inspect.signature(method).bind()
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 class GymnasiumSystem:
     """The managed-system port over one environment.
 
@@ -121,6 +131,12 @@ class GymnasiumSystem:
         self._mask: npt.NDArray[np.int8] | None = None
         self._actions = self._action_range()
         self._windows: tuple[int, int, tuple[int, ...]] | None = None
+        self._connected = False
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions of its action space."""
+        return len(self._actions)
 
     def available(self, episode: int) -> tuple[int, ...] | None:
         """Return the actions of episode `episode` from the rules' windows, or None where only a reset can tell."""
@@ -137,11 +153,15 @@ class GymnasiumSystem:
     def begin(self, episode: Episode) -> tuple[int, tuple[int, ...]]:
         """Reset the environment for an episode; return the first state and the available actions.
 
+        Before its first reset, and not before, it is connected: by its `connect`, where it has one that takes nothing.
+
         Raises
         ------
         ManagedSystemError
-            It offers an action that its action space does not have, or a mask of another length.
+            It cannot be connected, offers an action that its action space does not have, or a mask of another length.
         """
+        if not self._connected:
+            self._connect(episode.number)
         options: dict[str, Any] = {"episode": episode.number}
         if self.rules is not None:
             # Where the config's step cap is below the system's own, the rest of the block is never reached.
@@ -229,6 +249,18 @@ class GymnasiumSystem:
     def says_state(self) -> bool:
         """Whether the environment says what it carries from one episode to the next."""
         return hasattr(self._base, "get_state") and hasattr(self._base, "set_state")
+
+    def _connect(self, number: int) -> None:
+        connect = getattr(self._base, "connect", None)
+        if connect is not None and _takes_nothing(connect):
+            try:
+                connect()
+            except FAULTS as error:
+                raise ManagedSystemError(
+                    f"{self.name} raised {told(error)}, when it was to connect before episode {number}. The "
+                    f"{number - 1} passes before it stand in the log."
+                ) from error
+        self._connected = True
 
     def _action_range(self) -> range:
         # Asked at each reset: an environment may reassign its action space.

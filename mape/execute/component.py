@@ -32,6 +32,9 @@ class Execute:
     An episode is a pure function of (config, seed, trial, number, Q, plan): its randomness is a block of uniforms of
     fixed size from the trial's generator, and for systems that do not take it a seed made from seed, trial and number.
 
+    Making one does nothing to the system. Where only a reset can tell which actions there are, there is no Q-table
+    before the first episode is begun.
+
     Parameters
     ----------
     system, learner
@@ -50,15 +53,14 @@ class Execute:
     max_actions
         Largest number of actions that the run's records can hold.
     checkpoint
-        State and Q-table, as `state` gives them. This Execute goes on from there, as by `restore`, but resets its
-        system for no episode that is over.
+        State and Q-table, as `state` gives them. This Execute goes on from there, as by `restore`.
 
     Raises
     ------
     ConfigError
         The engine is ``"compiled"``, and the system offers no rules, or some that cannot be compiled.
     ManagedSystemError
-        The system raised at its reset, offers no legal action, or does not go on from what the checkpoint carries.
+        The system offers no legal action, or does not go on from what the checkpoint carries.
     PartError
         The checkpoint is not of an Execute of the same config.
     """
@@ -112,17 +114,29 @@ class Execute:
         self._enabled: tuple[int, ...] = ()  # by all plans so far
         self._rate = rate_array((0.0,) * len(learner.rate_names))
 
+        self._table: QTable | None = None
         self._begun = 0  # the episode whose reset has been done ahead of its drive
-        if checkpoint is None:
-            first = system.available(1)
-            if first is None:  # only a reset can tell; episode 1 then goes on from it
-                first = self._begin(1, self.uniforms.find(0))
-                self._begun = 1
-            self._take_actions(first, 1)
-            self._set_table(QTable(first, system.n_states))
-        else:
+        if checkpoint is not None:
             self.restore(*checkpoint)
+        elif (first := system.available(1)) is not None:  # else only the reset of episode 1 can tell
+            self._set_up(first)
         knowledge.serve_q_table(lambda: self.q_table.copy())
+
+    @property
+    def q_table(self) -> QTable:
+        """The Q-table.
+
+        Raises
+        ------
+        PartError
+            There is none yet: only the first reset tells which actions the system has.
+        """
+        if self._table is None:
+            raise PartError(
+                f"there is no Q-table yet: which actions {self.system.name} has, its first reset tells, which is that "
+                "of episode 1"
+            )
+        return self._table
 
     def record_trace(self, first: int, last: int, listener: Callable[[int, npt.NDArray[np.float64]], object]) -> None:
         """Hand the steps of episodes `first` to `last` to `listener`, with the columns of `TRACE_COLUMNS`."""
@@ -148,13 +162,16 @@ class Execute:
         if changed:
             rates = adoption.checked_rate(plan, self.learner)
         if add or drop or enable or adopt is not None:
+            if self._table is None:
+                self._begin_first()
             table = adoption.table_after(plan, self.q_table, self.available, self.system, self._knowledge)
             if enable:
                 self._enable(plan)
             self._set_table(table)
         if changed:
             self._rate = rates
-            self._fix_arguments()
+            if self._table is not None:
+                self._fix_arguments()
         self.plan = plan
 
     def drive(self) -> None:
@@ -175,6 +192,8 @@ class Execute:
 
         available = self.system.available(number) if self.rules is not None else None
         if available is None:
+            if self._table is None:
+                self._begin_first()
             if self._begun == number:
                 available, self._begun = self.available, 0
             else:
@@ -212,8 +231,9 @@ class Execute:
 
     def observe(self, steps: int, signals: dict[str, float]) -> None:
         """Send the Observation of the next pass, whose episode is driven; if it is not taken, nothing was learnt."""
-        plan = self.plan
+        plan, table = self.plan, self._table
         assert plan is not None
+        assert table is not None
         self.passes += 1
         try:
             self._send(
@@ -227,7 +247,7 @@ class Execute:
                         plan.reset_detector,
                         steps,
                         self.available,
-                        self.q_table.actions,
+                        table.actions,
                         signals,
                     ),
                 )
@@ -324,6 +344,9 @@ class Execute:
                 f"learner {type(learner).__name__} takes {len(new)} learning-rate parameters ({', '.join(new)}), the "
                 f"one before it {len(old)} ({', '.join(old)}); the number is fixed for a run"
             )
+        if self._table is None:
+            self.learner = learner  # bound with the table
+            return
         self._drive, self.learner = self._bound(learner), learner
         self._fix_arguments()
 
@@ -347,6 +370,16 @@ class Execute:
             learner.bootstrap_terminal,
             *self._limits,
         )
+
+    def _begin_first(self) -> None:
+        """Begin episode 1, which tells what the Q-table has rows for; its drive goes on from there."""
+        first = self._begin(1, self.uniforms.find(0))
+        self._begun = 1
+        self._set_up(first)
+
+    def _set_up(self, first: tuple[int, ...]) -> None:
+        self._take_actions(first, 1)
+        self._set_table(QTable(first, self.system.n_states))
 
     def _begin(self, number: int, at: int) -> tuple[int, ...]:
         seed, *key = self._seeds
@@ -383,7 +416,7 @@ class Execute:
             signals[name] = value
 
     def _set_table(self, table: QTable) -> None:
-        self.q_table = table
+        self._table = table
         self._workspace.open(table)
         self._knowledge.actions = table.actions
         self._set_rows(self.available)

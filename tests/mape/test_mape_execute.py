@@ -86,8 +86,9 @@ def test_a_run_that_goes_on_after_a_failed_episode_is_the_run_without_the_failur
 
     loop = corridor_loop(Corridor(spoil=spoil))
     loop.run(episode - 1)
+    fresh = QTable((0, 1), loop.system.n_states)
     for _ in range(failures):
-        before = loop.execute.q_table.sha256()
+        before = fresh.sha256() if episode == 1 else loop.execute.q_table.sha256()
         with pytest.raises(ManagedSystemError):
             loop.run(1)
         assert loop.execute.q_table.sha256() == before
@@ -319,9 +320,9 @@ def test_a_plan_with_another_number_of_learning_rates_is_refused_with_their_name
 @pytest.mark.parametrize("fields", [{"drop": (7,)}, {"adopt": "0" * 64}])
 def test_a_plan_that_cannot_be_executed_changes_nothing(fields):
     execute, _, knowledge = execute_on(Corridor())
-    before = execute.q_table.sha256()
     with pytest.raises(PartError, match="plan 0 cannot be executed"):
         execute.adopt(first_plan(add=(5,), **fields))
+    before = QTable((0, 1), 5).sha256()
     assert (execute.q_table.sha256(), knowledge.actions) == (before, (0, 1))
 
 
@@ -352,7 +353,7 @@ def test_the_signals_are_return_steps_td_error_and_change_and_then_the_systems_o
     rows = []
     execute.record_trace(1, 1, lambda number, trace: rows.extend(trace.tolist()))
     execute.adopt(first_plan())
-    before = execute.q_table.values.copy()
+    before = np.zeros((2, 5))
     execute.drive()
     signals = sent[0].signals
     assert list(signals) == [*SIGNALS, "cell"]

@@ -145,14 +145,30 @@ def test_an_execute_that_goes_on_from_a_state_resets_its_system_for_the_next_epi
 def test_without_a_state_the_first_reset_tells_the_actions_and_is_that_of_episode_1():
     corridor = Corridor(offers=lambda episode: (3, 1))
     execute, knowledge = executes(corridor, [])
-    assert (execute.available, knowledge.actions) == ((3, 1), (3, 1))
+    assert (corridor.begun, execute.available, knowledge.actions) == ([], (), ())
+    with pytest.raises(PartError, match="corridor has, its first reset tells, which is that of episode 1"):
+        knowledge.q_table()
     execute.adopt(PLAN)
+    assert corridor.begun == []
+    driven(execute, 1)
+    assert (execute.available, knowledge.actions) == ((3, 1), (3, 1))
+    driven(execute, 1)
+    assert [told.number for told in corridor.begun] == [1, 2]
+
+
+def test_a_first_plan_that_changes_the_table_begins_the_episode_that_follows_it():
+    corridor = Corridor()
+    execute, _ = executes(corridor, [])
+    execute.adopt(PLAN._replace(add=(4,)))
+    assert ([told.number for told in corridor.begun], execute.q_table.actions) == ([1], (0, 1, 4))
     driven(execute, 2)
     assert [told.number for told in corridor.begun] == [1, 2]
 
 
 def test_an_execute_is_not_made_of_a_state_that_does_not_fit():
-    state, table = corridor_loop().execute.state()
+    loop = corridor_loop()
+    loop.run(1)
+    state, table = loop.execute.state()
     with pytest.raises(PartError, match="cannot go on with a Q-table of 9 states; corridor has 5"):
         executes(Corridor(), [], (state, QTable((0, 1), 9)))
     with pytest.raises(PartError, match="Execute cannot go on from"):
