@@ -55,7 +55,7 @@ def _of_config(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
         raise ConfigError(f"of a config the system is checked; give the name of the {chosen.kind} itself")
     config = config_of(chosen.name, chosen).system
     played = ", from its transition table" if config.tabulated else ""
-    return "system", f"{config.id} of {chosen.name}{played}", _system(config)
+    return "system", f"{config.id} of {chosen.name}{played}", _system(config, chosen.drive)
 
 
 def _of_name(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
@@ -64,7 +64,9 @@ def _of_name(chosen: argparse.Namespace) -> tuple[str, str, list[Finding]]:
         option = "--profile" if chosen.profile else "--set"
         raise ConfigError(f"{option} is laid over a config; {name!r} is the name of a {kind}")
     if kind == "system":
-        return kind, name, _default_system(name)
+        return kind, name, _system(SystemConfig(id=name), chosen.drive, by_name=True)
+    if chosen.drive is not None:
+        raise ConfigError(f"--drive {chosen.drive} is of a system, whose episodes are driven; {name!r} is a {kind}")
     spec = _spec(kind, name, chosen.overrides)
     options = ", ".join(f"{option} = {value!r}" for option, value in spec.options.items())
     return kind, f"{name} ({options})" if options else name, testing.CHECKS[kind](_maker(kind, spec))
@@ -130,16 +132,8 @@ def _maker(kind: str, spec: PartSpec) -> Callable[[], Any]:
     return lambda: make(kind, spec)
 
 
-def _default_system(name: str) -> list[Finding]:
-    from adapters.systems.checking import default_view
+def _system(config: SystemConfig, episodes: int | None, *, by_name: bool = False) -> list[Finding]:
+    from adapters.systems.checking import check_managed
 
     registry.look_here()
-    return _system(default_view(name))
-
-
-def _system(config: SystemConfig) -> list[Finding]:
-    from adapters.systems import make_system
-    from adapters.systems.checking import check_environment
-
-    registry.look_here()
-    return [check_environment(config), *testing.check_system(lambda: make_system(config))]
+    return check_managed(config, episodes, by_name=by_name)

@@ -229,6 +229,11 @@ def parser() -> argparse.ArgumentParser:
         "--kind", choices=["detector", "analyzer", "planner", "schedule", "learner", "system"],
         help="what it is to be (default: told by its name or its members)",
     )  # fmt: skip
+    check.add_argument(
+        "--drive", type=_natural, metavar="N",
+        help="episodes of a system that each clause drives (default 5; none of one that cannot be driven again, such "
+        "as a plant, of which one object is made)",
+    )  # fmt: skip
     return top
 
 

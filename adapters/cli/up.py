@@ -112,7 +112,7 @@ def _check(config: Config) -> object:
     if is_plant(config.system):  # only Execute makes it, and tells what cannot be told without
         for kind, _, spec in parts_of(config):
             make(kind, spec)
-        return "what is compiled, Execute says: a plant is made by it alone"
+        return None
     # What a free-running system is made of can be looked at as if it waited.
     still = config.execute.model_copy(update={"mode": "lockstep", "rate": None})
     return check(config.model_copy(update={"execute": still}), in_processes=True)

@@ -123,9 +123,7 @@ def run_agents(
     """
     if lend is None:
         with Lender() as lend:
-            return run_agents(
-                configs, folder, workers=workers, trace=trace, quiet=quiet, prepare=prepare, lend=lend
-            )
+            return run_agents(configs, folder, workers=workers, trace=trace, quiet=quiet, prepare=prepare, lend=lend)
     most = workers or os.cpu_count() or 1
     seconds = 0.0
     finished = {agent: folder.finished(agent) for agent in configs}
@@ -219,9 +217,7 @@ def _stage(loop: Loop, first: int, in_processes: bool) -> Stage:
     return Stage(first, "episodes" if loop.execute.compiled else "nothing", obstacles)
 
 
-def _run_in_workers(
-    tasks: list[Task], assemblies: list[tuple[Any, ...]], workers: int, bar: Any, lend: Lender
-) -> None:
+def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], workers: int, bar: Any, lend: Lender) -> None:
     # This process is the first of the workers: it is there already, with all that is compiled. Spawn the others, never
     # fork: a forked process inherits threads' locks. And processes, not threads: what is not compiled of a trial takes
     # as long as what is, and holds the lock of the interpreter.

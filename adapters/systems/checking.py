@@ -11,13 +11,16 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from adapters.systems.gymnasium_system import make_env, rules_of
+from adapters.systems.gymnasium_system import GymnasiumSystem, connect, make_env, make_system, rules_of
 from managed_systems import register_envs
 from mape.config import BoxGrid, SystemConfig
 from mape.states import FAULTS, told
-from mape.testing import Finding
+from mape.testing import Finding, check_plant, check_system
+from mape.testing.systems import EPISODES
 
 _DECORATION = re.compile(r"\x1b\[\d*m|WARN: ")  # Gymnasium's logger colours its warnings
+
+CHECK_ENV = "passes Gymnasium's check_env"
 
 HUGE = 1e6
 """A bound beyond it says no more of the observations than an infinite one does."""
@@ -29,21 +32,52 @@ def is_registered(name: str) -> bool:
     return name in gymnasium.registry
 
 
-def default_view(name: str) -> SystemConfig:
-    """Return a config under which a check can drive the environment: a step cap and a grid where it has none."""
-    env = make_env(SystemConfig(id=name))
+def default_view(name: str, env: gymnasium.Env[Any, Any]) -> SystemConfig:
+    """Return a config under which a check can drive an environment: a step cap and a grid where it has none."""
+    grid = None
+    space: Any = env.observation_space
+    if isinstance(space, spaces.Box):
+        low, high = np.ravel(space.low).tolist(), np.ravel(space.high).tolist()
+        spans = [_span(float(a), float(b)) for a, b in zip(low, high, strict=True)]
+        grid = BoxGrid(low=tuple(a for a, _ in spans), high=tuple(b for _, b in spans), bins=(3,) * len(spans))
+    capped = env.spec is not None and env.spec.max_episode_steps is not None
+    has_own = rules_of(env) is not None
+    return SystemConfig(id=name, max_steps=None if capped or has_own else 200, discretise=grid)
+
+
+def check_managed(config: SystemConfig, episodes: int | None = None, *, by_name: bool = False) -> list[Finding]:
+    """Hold a system against its contract.
+
+    Parameters
+    ----------
+    config
+        The system.
+    episodes
+        How many each clause drives; None for `EPISODES`, and for none of a plant, of which one object is made, and
+        which is reset for nothing else.
+    by_name
+        Whether only its id is given, and how it is seen is found out.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be made.
+    """
+    env = make_env(config)
     try:
-        grid = None
-        space: Any = env.observation_space
-        if isinstance(space, spaces.Box):
-            low, high = np.ravel(space.low).tolist(), np.ravel(space.high).tolist()
-            spans = [_span(float(a), float(b)) for a, b in zip(low, high, strict=True)]
-            grid = BoxGrid(low=tuple(a for a, _ in spans), high=tuple(b for _, b in spans), bins=(3,) * len(spans))
-        capped = env.spec is not None and env.spec.max_episode_steps is not None
-        has_own = rules_of(env) is not None
-        return SystemConfig(id=name, max_steps=None if capped or has_own else 200, discretise=grid)
+        if by_name:
+            config = default_view(config.id, env)
+        redrivable = config.redrivable if config.redrivable is not None else getattr(env.unwrapped, "redrivable", True)
+        if not redrivable:
+            unasked = Finding(CHECK_ENV, "note", "left out, for it resets as it likes")
+            return [unasked, *check_plant(GymnasiumSystem(env, config), episodes or 0)]
     finally:
         env.close()
+    episodes = EPISODES if episodes is None else episodes
+    first = (
+        check_environment(config) if episodes else Finding(CHECK_ENV, "note", "left out, as nothing is to be driven")
+    )
+    return [first, *check_system(lambda: make_system(config), episodes)]
 
 
 def _span(low: float, high: float) -> tuple[float, float]:
@@ -57,15 +91,15 @@ def _span(low: float, high: float) -> tuple[float, float]:
 
 def check_environment(config: SystemConfig) -> Finding:
     """Run Gymnasium's own checker over the environment, and return what it says as a finding."""
-    clause = "passes Gymnasium's check_env"
     env = make_env(config)
     try:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
+            connect(env)
             check_env(env.unwrapped, skip_render_check=True)
     except FAULTS as error:
-        return Finding(clause, "failed", told(error))
+        return Finding(CHECK_ENV, "failed", told(error))
     finally:
         env.close()
     remarks = "; ".join(sorted({_DECORATION.sub("", str(warning.message).splitlines()[0]) for warning in said}))
-    return Finding(clause, "note" if remarks else "ok", remarks)
+    return Finding(CHECK_ENV, "note" if remarks else "ok", remarks)

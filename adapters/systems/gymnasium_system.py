@@ -86,13 +86,14 @@ def _own_rules(base: Any) -> StepRules | None:
     return rules if all(hasattr(rules, name) for name in _RULES) else None
 
 
-def _takes_nothing(method: Any) -> bool:
-    """Whether a method can be called without arguments; a `connect` that wants some is another thing than ours."""
+def connect(env: gymnasium.Env[Any, Any]) -> None:
+    """Connect an environment that has a `connect`; one that wants arguments is another thing than ours."""
+    method: Any = getattr(env.unwrapped, "connect", None)
     try:
-        inspect.signature(method).bind()
+        inspect.signature(method).bind()  # what is no function is refused as well
     except (TypeError, ValueError):
-        return False
-    return True
+        return
+    method()
 
 
 class GymnasiumSystem:
@@ -251,15 +252,13 @@ class GymnasiumSystem:
         return hasattr(self._base, "get_state") and hasattr(self._base, "set_state")
 
     def _connect(self, number: int) -> None:
-        connect = getattr(self._base, "connect", None)
-        if connect is not None and _takes_nothing(connect):
-            try:
-                connect()
-            except FAULTS as error:
-                raise ManagedSystemError(
-                    f"{self.name} raised {told(error)}, when it was to connect before episode {number}. The "
-                    f"{number - 1} passes before it stand in the log."
-                ) from error
+        try:
+            connect(self.env)
+        except FAULTS as error:
+            raise ManagedSystemError(
+                f"{self.name} raised {told(error)}, when it was to connect before episode {number}. The {number - 1} "
+                "passes before it stand in the log."
+            ) from error
         self._connected = True
 
     def _action_range(self) -> range:

@@ -26,6 +26,7 @@ from mape.testing.clauses import Finding, require
 from mape.testing.decisions import check_analyzer, check_planner, check_schedule
 from mape.testing.detectors import check_detector
 from mape.testing.learners import check_learner
+from mape.testing.plants import check_plant
 from mape.testing.systems import check_system
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "check_detector",
     "check_learner",
     "check_planner",
+    "check_plant",
     "check_schedule",
     "check_system",
     "require",

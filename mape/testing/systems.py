@@ -45,8 +45,34 @@ EPISODES = 5
 LONGEST = 200
 
 
-def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
+MEMBERS = (
+    "name n_states max_steps signal_names drifts draws redrivable rules "
+    "available() begin() step() explorable() enable() get_state() set_state() close()"
+)
+"""What a managed system has."""
+
+
+def describe(system: ManagedSystem) -> None:
+    """Look at what a system says of itself; a clause is broken where that is of a wrong kind."""
+    whole = {"n_states": (system.n_states, 1), "max_steps": (system.max_steps, 1)}
+    whole |= {f"draws[{i}]": (draws, 0) for i, draws in enumerate(system.draws)}
+    for name, (number, least) in whole.items():
+        if type(number) is not int or number < least:
+            raise Broken(f"{name} is {number!r}; give an int of at least {least}")
+    names = system.signal_names
+    if not isinstance(names, tuple) or len({*names, *SIGNALS}) != len(names) + len(SIGNALS):
+        raise Broken(f"signal_names is {names!r}; give a tuple of distinct names, none of {', '.join(SIGNALS)}")
+    if type(system.redrivable) is not bool:
+        raise Broken(f"redrivable is {system.redrivable!r}; it is True or False")
+    if list(system.drifts) != sorted({*system.drifts}):
+        raise Broken(f"drifts is {system.drifts!r}; give increasing episodes")
+
+
+def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) -> list[Finding]:
     """Check a managed system by random episodes; one with rules is learnt compiled and by calls, too.
+
+    Each clause drives `episodes` of them; with 0 nothing is driven, and only what the system says of itself is looked
+    at. One that cannot be driven again is a case for `check_plant`.
 
     Whether its environment keeps to Gymnasium's own contract is a question for `gymnasium.utils.env_checker`.
     """
@@ -56,29 +82,14 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
         made.append(make())
         return made[-1]  # type: ignore[no-any-return]
 
-    def described() -> None:
-        system = fresh()
-        whole = {"n_states": (system.n_states, 1), "max_steps": (system.max_steps, 1)}
-        whole |= {f"draws[{i}]": (draws, 0) for i, draws in enumerate(system.draws)}
-        for name, (number, least) in whole.items():
-            if type(number) is not int or number < least:
-                raise Broken(f"{name} is {number!r}; give an int of at least {least}")
-        names = system.signal_names
-        if not isinstance(names, tuple) or len({*names, *SIGNALS}) != len(names) + len(SIGNALS):
-            raise Broken(f"signal_names is {names!r}; give a tuple of distinct names, none of {', '.join(SIGNALS)}")
-        if type(system.redrivable) is not bool:
-            raise Broken(f"redrivable is {system.redrivable!r}; it is True or False")
-        if list(system.drifts) != sorted({*system.drifts}):
-            raise Broken(f"drifts is {system.drifts!r}; give increasing episodes")
-
     def plays() -> None:
         system = fresh()
-        for number in range(1, EPISODES + 1):
+        for number in range(1, episodes + 1):
             _play(system, number)
 
     def foretells() -> None:
         system = fresh()
-        for number in range(1, EPISODES + 1):
+        for number in range(1, episodes + 1):
             told = system.available(number)
             _, found = system.begin(_episode(system, number))
             if told is not None and {*told} != {*found}:
@@ -86,7 +97,7 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
 
     def deterministic() -> None:
         first, second = fresh(), fresh()
-        for number in range(1, EPISODES + 1):
+        for number in range(1, episodes + 1):
             _compare(_play(first, number), _play(second, number), f"episode {number} of two fresh ones")
 
     def redriven() -> None:
@@ -97,10 +108,10 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
                 "again, and a run is not taken up elsewhere to the same bits"
             )
         played = {}
-        for number in range(1, EPISODES + 1):
+        for number in range(1, episodes + 1):
             carried = _carried(system)
             played[number] = (carried, _play(system, number))
-        for number in (EPISODES, 1, 3, 3):
+        for number in (episodes, 1, middle := (episodes + 1) // 2, middle):
             carried, moments = played[number]
             if carried is not None:
                 _carried(other, carried)
@@ -121,13 +132,13 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
         system, other = fresh(), fresh()
         if system.rules is None:
             raise Noted("offers no rules, so that its episodes are called step by step and not compiled")
-        for number in range(1, EPISODES + 1):
+        for number in range(1, episodes + 1):
             _compare(_play(system, number), _play_by_rules(other, number), f"episode {number}, by step() and by rules")
 
     def compiled() -> None:
         if fresh().rules is None:
             raise Noted("offers no rules")
-        called, ran = (_learn(fresh(), engine) for engine in ("python", "compiled"))
+        called, ran = (_learn(fresh(), engine, episodes) for engine in ("python", "compiled"))
         for number, (one, other) in enumerate(zip(called, ran, strict=True), 1):
             if one != other:
                 raise Broken(
@@ -137,17 +148,16 @@ def check_system(make: Callable[[], ManagedSystem]) -> list[Finding]:
 
     findings = judge(
         fresh,
-        "name n_states max_steps signal_names drifts draws redrivable rules "
-        "available() begin() step() explorable() enable() get_state() set_state() close()",
+        MEMBERS,
         [
-            ("describes itself in numbers", described),
+            ("describes itself in numbers", lambda: describe(fresh())),
             ("stays within its states, with finite rewards and known actions", plays),
             ("says beforehand which actions an episode offers, or nothing", foretells),
             ("is deterministic: two fresh ones play the same episodes", deterministic),
             ("plays an episode the same whatever was played before", redriven),
             ("has rules that equal its steps, bit for bit", by_rules),
             ("learns the same Q-table compiled and called", compiled),
-        ],
+        ][: None if episodes else 1],
     )
     for system in made:
         if hasattr(system, "close"):
@@ -167,6 +177,11 @@ def _carried(system: ManagedSystem, state: Any = None) -> Any:
         system.set_state(json.loads(state))
     carried = system.get_state()
     return None if carried is None else plain_json(carried)
+
+
+def play_at_random(system: ManagedSystem, number: int) -> None:
+    """Drive an episode by random actions; a clause is broken where it leaves its states, actions or finite numbers."""
+    _play(system, number)
 
 
 def _play(system: ManagedSystem, number: int) -> list[_Moment]:
@@ -237,13 +252,13 @@ def _compare(one: list[_Moment], other: list[_Moment], where: str) -> None:
         raise Broken(f"{where} has {len(one) - 1} and {len(other) - 1} steps")
 
 
-def _learn(system: ManagedSystem, engine: str) -> list[Any]:
+def _learn(system: ManagedSystem, engine: str, episodes: int) -> list[Any]:
     """Return the observations of a few episodes and, last, the hash of the Q-table."""
     learnt: list[Any] = []
     knowledge = Knowledge(Log(RowLayout(SIGNALS + system.signal_names, 0, 3, 4096)))
     learner = registry.build("learner", PartSpec(name="q_learning"))
     execute = Execute(system, learner, knowledge, learnt.append, engine=engine, max_actions=4096)
     execute.adopt(ChangePlan(0, 0, 0.5, (0.1, 0.9, 5.0), (), (), (), False, None))
-    for _ in range(EPISODES):
+    for _ in range(episodes):
         execute.drive()
     return [*learnt, execute.q_table.sha256()]

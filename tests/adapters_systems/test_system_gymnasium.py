@@ -13,6 +13,7 @@ from gymnasium.wrappers import TimeLimit, TransformReward
 
 from adapters.systems import GymnasiumSystem, make_system
 from adapters.systems.checking import default_view
+from adapters.systems.gymnasium_system import make_env
 from adapters.systems.state_index import state_index
 from managed_systems.gridworld import Gridworld
 from mape.config import SystemConfig, from_table
@@ -20,6 +21,14 @@ from mape.errors import ConfigError, ManagedSystemError
 from mape.loop import Loop
 from mape.ports import Episode
 from mape.testing import check_system
+
+
+def view(name):
+    env = make_env(SystemConfig(id=name))
+    try:
+        return default_view(name, env)
+    finally:
+        env.close()
 
 
 class Shifted(gymnasium.Env):
@@ -98,8 +107,8 @@ def test_rules_count_only_where_no_wrapper_changes_what_they_say() -> None:
 def test_a_wrapped_system_keeps_what_it_declares_and_every_clause() -> None:
     system = make_system(SystemConfig(id="Hundredth-v0", options={"switch_at": [3]}))
     assert (system.rules, system.max_steps, system.drifts, system.draws) == (None, 37, (3,), (0, 0))
-    assert default_view("Hundredth-v0").max_steps == 200
-    assert default_view("mapek/Gridworld-v0").max_steps is None
+    assert view("Hundredth-v0").max_steps == 200
+    assert view("mapek/Gridworld-v0").max_steps is None
     assert "failed" not in {f.verdict for f in check_system(lambda: make_system(SystemConfig(id="Hundredth-v0")))}
 
 
@@ -118,7 +127,7 @@ def test_time_limits_are_transparent_and_the_least_of_them_caps_both_engines() -
 def test_an_attribute_that_is_called_rules_and_is_none_is_no_rules() -> None:
     system = make_system(SystemConfig(id="House-v0"))
     assert (system.rules, system.draws, system.max_steps) == (None, (0, 0), 4)
-    assert default_view("House-v0").max_steps is None
+    assert view("House-v0").max_steps is None
     env = Shifted()
     env.rules = SimpleNamespace(**{**Gridworld().rules._asdict()})
     del env.rules.explorable
@@ -233,7 +242,7 @@ class Boxed(gymnasium.Env):
 )
 def test_a_box_is_checked_through_a_grid_of_its_own_bounds_where_they_are_of_use(low, high, grid):
     gymnasium.register("Boxed-v0", lambda: Boxed(low, high), max_episode_steps=4)
-    config = default_view("Boxed-v0")
+    config = view("Boxed-v0")
     assert (config.discretise.low, config.discretise.high) == ((grid[0],), (grid[1],))
     system = make_system(config)
     state, actions = system.begin(Episode(1, 0, np.empty(0)))
