@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import gymnasium
-from gymnasium.envs.registration import load_env_creator
-
-from mape.config import Config, SystemConfig
+from adapters.systems.declared import is_plant
+from mape.config import Config
 from mape.tables import first_difference
 
 PROCESS = ("id", "options", "max_steps", "discretise")
@@ -39,22 +36,8 @@ def pairing(first: Config, second: Config) -> Pairing:
         what, one, other = first_difference(here, there)
         return Pairing("apart", f"system.{what} is {one!r} of the first and {other!r} of this one")
     for config in (first, second):
-        if not reached_by_seeds(config.system):
+        if is_plant(config.system):  # no episode can be had again
             return Pairing("independent", f"{config.system.id} is not redrivable, and no seed reaches its luck")
     if first.system.tabulated != second.system.tabulated:
         return Pairing("independent", "only one of them is played from its transition table, by other random numbers")
     return Pairing("paired")
-
-
-def reached_by_seeds(config: SystemConfig) -> bool:
-    """Whether a trial's seed decides what the system does: not so where no episode can be had again."""
-    if config.redrivable is not None:
-        return config.redrivable
-    module, _, name = config.id.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    spec = gymnasium.registry.get(name)
-    if spec is None or spec.entry_point is None:
-        return True
-    maker: Any = spec.entry_point
-    return bool(getattr(load_env_creator(maker) if isinstance(maker, str) else maker, "redrivable", True))
