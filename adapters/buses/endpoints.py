@@ -12,8 +12,10 @@ import re
 import socket
 import ssl
 import stat
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from mape.errors import BusError, ConfigError
 
@@ -22,6 +24,15 @@ UNIX = "unixsock-stream/"
 
 LOOK_WITHIN = 0.3
 """Seconds that somebody has to answer who is only looked at."""
+
+SPEAKS_WITHIN = 1.0
+"""Seconds that who listens has at least to say the first word over a link that stands."""
+
+ROUND_TRIPS = 20
+"""So many times as long as the link itself took, the first word over it is waited for."""
+
+FAR = 0.02
+"""Seconds that a link takes to come about where time may have been up before one was let in."""
 
 LONGEST_PATH = 107
 """Bytes of the longest path that the kernel takes for a socket."""
@@ -173,7 +184,14 @@ def _check_replaceable(endpoint: str, path: str, kind: Callable[[int], bool]) ->
         )
 
 
-def who_listens(place: tuple[str, int], authority: Path | None) -> str | None:
+class Found(NamedTuple):
+    """Who was found at a host and port, as a sentence; and whether all that is known is that time was up."""
+
+    why: str
+    slow: bool = False
+
+
+def who_listens(place: tuple[str, int], authority: Path | None, within: float) -> Found | None:
     """Say why who listens at a host and port does not answer, as far as can be seen; None where nobody listens.
 
     Parameters
@@ -182,28 +200,52 @@ def who_listens(place: tuple[str, int], authority: Path | None) -> str | None:
         Host and port.
     authority
         Certificate of the authority of one's own keys; None without keys.
+    within
+        Seconds that a link has to come about.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     if authority is None:
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     else:
         context.load_verify_locations(authority)
+    begun = time.monotonic()
     try:
-        link = socket.create_connection(place, LOOK_WITHIN)
+        link = socket.create_connection(place, within)
+    except TimeoutError:
+        return Found(f"no link to it came about within {within:.1f} s: the network is slow, or cut", slow=True)
     except (OSError, UnicodeError):  # the second, where the host's name is none
         return None
+    took = time.monotonic() - begun
+    # Who has not said a word after so many round trips does not do so because the way is long.
+    answers_within = max(SPEAKS_WITHIN, ROUND_TRIPS * took)
     with link:
+        link.settimeout(answers_within)
         try:
             context.wrap_socket(link, server_hostname=place[0]).close()
         except ssl.SSLCertVerificationError as error:
-            return (
+            return Found(
                 f"who listens there has a certificate that does not hold under {authority}: "
                 f"{error.verify_message.rstrip('.')}"
             )
+        except TimeoutError:
+            told = f"a link stood after {took:.2g} s, and nothing was said on it within {answers_within:.1f} s"
+            if authority is None:
+                return Found(f"who listens there does not answer ({told}): it is slow, or no Knowledge", slow=True)
+            return Found(
+                f"who listens there uses no keys, or stands still ({told}): give --tls to all processes of a run, or "
+                "to none",
+                slow=True,
+            )
         except OSError:  # of which TLS's errors are a kind
             if authority is None:
-                return "who listens there does not answer"
-            return "who listens there uses no keys: give --tls to all processes of a run, or to none"
+                return Found("who listens there does not answer")
+            return Found("who listens there uses no keys: give --tls to all processes of a run, or to none")
     if authority is None:
-        return "who listens there asks for keys: give --tls DIR"
-    return f"who listens there does not let one in who has the keys of {authority.parent}"
+        return Found("who listens there asks for keys: give --tls DIR")
+    if took > FAR:
+        return Found(
+            f"who listens there answers, and lets nobody in yet who has the keys of {authority.parent}: a link takes "
+            f"{took:.2g} s, and to be let in some times as long",
+            slow=True,
+        )
+    return Found(f"who listens there does not let one in who has the keys of {authority.parent}")

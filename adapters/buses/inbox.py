@@ -9,12 +9,16 @@ from typing import Any
 import zenoh
 
 from adapters.buses.questions import ANSWER_WITHIN
+from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, SINCE_LIMIT, Wire
 from knowledge import STAGES, MalformedRecord, Record, from_json
 from mape.errors import BusError
 
 SILENCE = 0.3
-"""Seconds without a publication after which Knowledge is asked whether one was missed."""
+"""Seconds without a publication after which Knowledge is asked whether one was missed, at the earliest."""
+
+LONGEST_SILENCE = 5.0
+"""Seconds of silence, or what an answer takes if that is more, after which it is asked however slow the loop is."""
 
 
 class Inbox:
@@ -31,6 +35,8 @@ class Inbox:
         Zenoh's for the answers; who takes them in hands them to `caught_up`.
     take
         Takes a record that is seen.
+    round_trip
+        How long answers take on this link.
 
     Attributes
     ----------
@@ -38,7 +44,9 @@ class Inbox:
     seal : Knowledge's.
     """
 
-    def __init__(self, wire: Wire, role: str, handler: Any, take: Callable[[Record], object]) -> None:
+    def __init__(
+        self, wire: Wire, role: str, handler: Any, take: Callable[[Record], object], round_trip: RoundTrip
+    ) -> None:
         self.get: Callable[..., object] | None = None
         self.seal = b""
         self._wire = wire
@@ -46,9 +54,12 @@ class Inbox:
         self._input = STAGES.index(INPUT[role])
         self._handler = handler
         self._take = take
+        self._round_trip = round_trip
+        self._turnaround = RoundTrip(LONGEST_SILENCE)  # of a loop, from one of its records to the next
         self._next: dict[int, int] = {}  # loop -> pass of the next record that is waited for
-        self._heard: dict[int, float] = {}  # when something of a loop came last, or was asked for
-        self._fetched: set[int] = set()  # loops of which an answer is awaited
+        self._heard: dict[int, float] = {}  # when something of a loop came last
+        self._fetched: dict[int, float] = {}  # loops of which an answer is awaited, and since when
+        self._nothing_new: dict[int, int] = {}  # loop -> answers in a row that brought nothing
 
     def watch(self, loop: int, number: int) -> None:
         """Wait for the records of a loop from pass `number` on.
@@ -65,10 +76,14 @@ class Inbox:
         """Wait for no more of a loop."""
         self._next.pop(loop, None)
         self._heard.pop(loop, None)
+        self._fetched.pop(loop, None)
 
-    def forget_questions(self) -> None:
-        """Await no answer any more: the session over which they would come is gone."""
+    def ask_again(self) -> None:
+        """Ask for all anew: the link over which answers and publications would have come was gone."""
         self._fetched.clear()
+        self._nothing_new.clear()
+        for loop in self._next:
+            self._fetch(loop)
 
     def hear(self, sample: zenoh.Sample) -> None:
         """Take a publication.
@@ -92,14 +107,20 @@ class Inbox:
         if record.pass_no > expected:
             self._fetch(record.loop)
             return
+        now = time.monotonic()
+        if (before := self._heard.get(record.loop)) is not None and not self._nothing_new.get(record.loop):
+            self._turnaround.took(now - before)
         self._next[record.loop] = expected + 1
-        self._heard[record.loop] = time.monotonic()
+        self._heard[record.loop] = now
+        self._nothing_new.pop(record.loop, None)
         self._take(record)
 
     def caught_up(self, loop: int, lines: Sequence[bytes]) -> None:
         """Take an answer to what was asked: records of a loop, in order."""
-        self._fetched.discard(loop)
-        news = False
+        now, news = time.monotonic(), False
+        if (asked := self._fetched.pop(loop, None)) is not None:
+            self._round_trip.took(now - asked)
+            self._heard[loop] = now
         for line in lines:
             record = from_json(line)
             expected = self._next.get(record.loop)
@@ -107,27 +128,38 @@ class Inbox:
                 self._next[record.loop] = record.pass_no + 1
                 self._take(record)
                 news = True
+        self._nothing_new[loop] = 0 if news else self._nothing_new.get(loop, 0) + 1
         # An answer that was read late, after its question was asked again, asks for no more.
         if news and len(lines) >= SINCE_LIMIT and loop in self._next:
             self._fetch(loop)
 
     def keep_up(self, now: float) -> None:
         """Ask for what may have been missed."""
+        answer, longest = self._round_trip.within(ANSWER_WITHIN), max(LONGEST_SILENCE, self._round_trip.expected)
+        silence = max(SILENCE, self._turnaround.expected)
+        in_vain = False
         for loop in self._next:
-            silent = now - self._heard.get(loop, 0.0)
-            if silent > (ANSWER_WITHIN if loop in self._fetched else SILENCE):
-                self._fetched.discard(loop)
+            asked = self._fetched.get(loop)
+            if asked is not None and now - asked > answer:
+                del self._fetched[loop]
+                in_vain = True
                 self._fetch(loop)
+            # Where there is nothing new, it is asked ever more rarely: the loop may be at work.
+            elif asked is None and now - self._heard.get(loop, 0.0) > min(
+                longest, silence * 2 ** min(16, self._nothing_new.get(loop, 0))
+            ):
+                self._fetch(loop)
+        if in_vain:
+            self._round_trip.in_vain()
 
     def _fetch(self, loop: int) -> None:
         if loop in self._fetched:
             return
-        self._fetched.add(loop)
-        self._heard[loop] = time.monotonic()
+        self._fetched[loop] = time.monotonic()
         if self.get is None:
             raise BusError(f"{self._role} is not connected; call connect()")
         # The answer is not waited for: a managed system that runs freely does not stand still for it.
         self.get(
             f"{self._wire.ask('since')}?loop={loop};from={self._input}:{self._next[loop]}", self._handler,
-            timeout=ANSWER_WITHIN, **ORDERED,
+            timeout=self._round_trip.within(ANSWER_WITHIN), **ORDERED,
         )  # fmt: skip

@@ -21,8 +21,9 @@ from adapters.buses.inbox import Inbox
 from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout
 from adapters.buses.outbox import Outbox
 from adapters.buses.questions import Questions, Refused
+from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Unanswered, Wire, hand_over, host, role_of
-from adapters.roles import STAGE_OF
+from adapters.roles import KNOWLEDGE, STAGE_OF
 from knowledge import MalformedRecord, Record, to_json
 from mape.errors import BusError
 
@@ -32,7 +33,10 @@ KEEP_UP_EVERY = 0.1
 """Seconds between two looks at what is outstanding."""
 
 DEAF_AFTER = 4.0
-"""Seconds of nothing but lost questions after which a session whose link stands is given up for a new one."""
+"""Seconds of nothing but lost questions, or what an answer takes if that is more, after which a session is given up."""
+
+FIRST_TRY = 0.5
+"""Seconds that the first try to open a session takes at most; each further one over a slow network twice as long."""
 
 BEAT_EVERY = 0.5
 """Seconds between two heartbeats."""
@@ -89,8 +93,8 @@ class Member(Questions):
         self._arrived: SimpleQueue[Any] = SimpleQueue()  # filled by Zenoh's threads, and by nobody else
         self._waiting: deque[Record | Asked] = deque()
         # Neither knows this Member: who lets go of it has it freed, and closed, at once.
-        self._inbox = Inbox(wire, role, hand_over(self._arrived, "since"), self._waiting.append)
-        self._outbox = Outbox(wire, role, hand_over(self._arrived, "ack"))
+        self._inbox = Inbox(wire, role, hand_over(self._arrived, "since"), self._waiting.append, self._round_trip)
+        self._outbox = Outbox(wire, role, hand_over(self._arrived, "ack"), self._round_trip)
         self._kept_up_at = self._beat_at = 0.0
         self._leave: Callable[..., object] | None = None
 
@@ -118,6 +122,10 @@ class Member(Questions):
             )
             self._inbox.get = self._outbox.get = session.get
             self._beats = session.declare_publisher(self.wire.beat(self.role), **ORDERED)
+            # Knowledge's token comes again with each new link to it: what was on its way over the last one is lost.
+            knowledge = self.wire.alive(KNOWLEDGE)
+            tokens = session.liveliness().declare_subscriber(knowledge, hand_over(self._arrived, "knowledge"))
+            opened.callback(tokens.undeclare)
             join()
             # Last: who sees the token knows that all else stands.
             token = session.liveliness().declare_token(self.wire.alive(self.role, self.joined.epoch))
@@ -142,13 +150,16 @@ class Member(Questions):
         self.close()
 
     def _open(self, deadline: float | None) -> zenoh.Session:
+        patience = RoundTrip(self.wire.patience)
         while True:
             try:
-                return self.wire.join(self.role, 0.5)
+                return self.wire.join(self.role, patience.within(FIRST_TRY))
             except Unanswered as error:
                 if deadline is not None and time.monotonic() > deadline:
                     raise
-                why = f" ({error})" if error.listens else ""
+                if error.slow:
+                    patience.in_vain()
+                why = f" ({error})" if error.found else ""
                 self._say(f"waiting for Knowledge on {self.wire.endpoint}{why}")
 
     def _join(self, deadline: float | None) -> None:
@@ -180,19 +191,24 @@ class Member(Questions):
         now = time.monotonic()
         self._deaf_since = now if self._deaf_since is None else self._deaf_since
         session, leave = self._session, self._leave
-        if now - self._deaf_since < DEAF_AFTER or session is None or leave is None:
+        if now - self._deaf_since < max(DEAF_AFTER, 2 * self._round_trip.expected) or session is None or leave is None:
             return
         self._deaf_since = None
         if not session.info.routers_zid():
             return  # Zenoh itself connects again
         try:
-            another = self.wire.join(self.role, 0.5)
+            another = self.wire.join(self.role, self._round_trip.within(FIRST_TRY))
         except BusError:
             return
         logger.warning("%s hears nothing from Knowledge, and opens another session", self.role)
         leave()
-        self._inbox.forget_questions()
         self._attach(another, lambda: None)
+        self._link_again()
+
+    def _link_again(self) -> None:
+        """Send and ask again what was under way over a link that is gone."""
+        self._outbox.send_all_again()
+        self._inbox.ask_again()
 
     # Sending.
 
@@ -306,6 +322,9 @@ class Member(Questions):
                     self._acknowledged(what)
                 elif kind == "since":
                     self._caught_up(what)
+                elif kind == "knowledge":
+                    if what.kind == zenoh.SampleKind.PUT:
+                        self._link_again()
                 else:
                     self._questioned(what)
                 kind, what = self._arrived.get_nowait()
@@ -337,7 +356,8 @@ class Member(Questions):
     def _keep_up(self, now: float) -> None:
         """Send again what was not acknowledged, and ask for what may have been missed."""
         self._kept_up_at = now + KEEP_UP_EVERY
-        self._outbox.keep_up(now)
+        if self._outbox.keep_up(now):
+            self._lost()
         self._inbox.keep_up(now)
 
     def _caught_up(self, reply: zenoh.Reply) -> None:

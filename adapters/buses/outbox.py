@@ -7,14 +7,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from adapters.buses.questions import ANSWER_WITHIN, Refused
+from adapters.buses.questions import Refused
+from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import ORDERED, Wire
 from adapters.roles import STAGE_OF
 from knowledge import STAGES
 from mape.errors import BusError
 
 RESEND_AFTER = 0.5
-"""Seconds without an acknowledgement after which a record is sent again."""
+"""Seconds without an acknowledgement after which a record is sent again, at the earliest."""
 
 REPEAT_AFTER = 0.05
 """The same, where Knowledge says that a record before another is missing."""
@@ -28,6 +29,7 @@ class _Sent(NamedTuple):
     payload: bytes
     attachment: bytes
     at: float
+    again: bool = False
 
 
 class Outbox:
@@ -39,17 +41,20 @@ class Outbox:
         Where Knowledge listens, and whose they are.
     handler
         Zenoh's for the answers; who takes them in tells `acknowledged`.
+    round_trip
+        How long answers take on this link.
 
     Attributes
     ----------
     get : the session's, None while there is none.
     """
 
-    def __init__(self, wire: Wire, role: str, handler: Any) -> None:
+    def __init__(self, wire: Wire, role: str, handler: Any, round_trip: RoundTrip) -> None:
         self.get: Callable[..., object] | None = None
         self._wire = wire
         self._role = role
         self._handler = handler
+        self._round_trip = round_trip
         self._sent: dict[int, deque[_Sent]] = {}
         self._kept: dict[int, int] = {}  # loop -> number of the last record of this stage that Knowledge has
 
@@ -96,25 +101,46 @@ class Outbox:
                 "started anew with an older log?"
             )
         self._kept[loop] = last
+        now, first = time.monotonic(), None
         while waiting and waiting[0].number <= last:
-            waiting.popleft()
+            first = waiting.popleft()
+            if not first.again:  # else nobody knows which of the two is answered
+                self._round_trip.took(now - first.at)
         if not waiting:
             return
-        # One that was lost lets all behind it come too early; they are not answered by as many repetitions.
-        if time.monotonic() - waiting[0].at > (REPEAT_AFTER if ack == "gap" else RESEND_AFTER):
-            self._send_again(loop)
+        # What was lost is what was sent before that which had to be sent again; or, where Knowledge misses something,
+        # what has had the time to come. The others are on their way, and they are not answered by as many repetitions.
+        lost_with_it = first is not None and first.again and not waiting[0].again and waiting[0].at < first.at
+        missed = ack == "gap" and now - waiting[0].at > max(REPEAT_AFTER, self._round_trip.expected)
+        if lost_with_it or missed:
+            self._send_again(loop, now, RESENT_AT_ONCE)
 
-    def keep_up(self, now: float) -> None:
-        """Send again what has waited for too long."""
+    def keep_up(self, now: float) -> bool:
+        """Send again what has waited for too long: the first of each loop, whose answer tells of the others.
+
+        Returns
+        -------
+        bool
+            Whether there was such a one.
+        """
+        long, in_vain = self._round_trip.within(RESEND_AFTER), False
         for loop, waiting in self._sent.items():
-            if waiting and now - waiting[0].at > RESEND_AFTER:
-                self._send_again(loop)
+            if waiting and now - waiting[0].at > long:
+                self._send_again(loop, now, 1)
+                in_vain = True
+        if in_vain:
+            self._round_trip.in_vain()
+        return in_vain
 
-    def _send_again(self, loop: int) -> None:
-        now = time.monotonic()
+    def send_all_again(self) -> None:
+        """Send again what was on its way over a link that is gone."""
+        for loop in self._sent:
+            self._send_again(loop, time.monotonic(), RESENT_AT_ONCE)
+
+    def _send_again(self, loop: int, now: float, most: int) -> None:
         waiting = self._sent[loop]
-        for i in range(min(len(waiting), RESENT_AT_ONCE)):
-            waiting[i] = waiting[i]._replace(at=now)
+        for i in range(min(len(waiting), most)):
+            waiting[i] = waiting[i]._replace(at=now, again=True)
             self._transmit(loop, waiting[i].payload, waiting[i].attachment)
 
     def _transmit(self, loop: int, payload: bytes, attachment: bytes) -> None:
@@ -122,5 +148,5 @@ class Outbox:
             raise BusError(f"{self._role} is not connected; call connect()")
         self.get(
             self._wire.append(self._role, loop), self._handler, payload=payload, attachment=attachment,
-            timeout=ANSWER_WITHIN, **ORDERED,
+            timeout=self._wire.patience, **ORDERED,  # an answer that comes late is one all the same
         )  # fmt: skip

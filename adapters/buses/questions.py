@@ -11,12 +11,13 @@ from typing import Any
 import zenoh
 
 from adapters.buses.messages import Happened, State, Swapped, Table
+from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import OF_CONFIG, ORDERED, Wire
 from knowledge import QTable, Record, from_json
 from mape.errors import BusError, ConfigError
 
 ANSWER_WITHIN = 2.0
-"""Seconds after which a question counts as lost, and is asked again."""
+"""Seconds after which a question counts as lost at the earliest, and is asked again."""
 
 _UNHEARD: Any = zenoh.handlers.Callback(lambda reply: None, indirect=False)
 
@@ -42,6 +43,7 @@ class Questions(ABC):
         self._told = ""
         self._session: zenoh.Session | None = None
         self._epoch = b""
+        self._round_trip = RoundTrip(wire.patience)
         self._deaf_since: float | None = None  # the first question that was lost, of those since the last answer
 
     @abstractmethod
@@ -82,12 +84,12 @@ class Questions(ABC):
         while True:
             # Nobody there, a hub that fell over the question, and one that is just restarting look the same: no reply.
             # To ask again is safe, as Knowledge takes everything once.
-            outcome = "no reply"
-            for reply in self._session.get(
-                key, payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
-            ):
+            outcome, asked_at = "no reply", time.monotonic()
+            patience = self._round_trip.within(ANSWER_WITHIN)
+            for reply in self._session.get(key, payload=payload, attachment=attachment, timeout=patience, **ORDERED):
                 if reply.ok is not None:
                     self._deaf_since = None
+                    self._round_trip.took(time.monotonic() - asked_at)
                     return bytes(reply.ok.payload.to_bytes())
                 outcome = "Timeout" if reply.err is None else reply.err.payload.to_string()
                 if outcome.startswith(OF_CONFIG):
@@ -95,6 +97,7 @@ class Questions(ABC):
                 if outcome != "Timeout" and not outcome.startswith("later: "):
                     raise Refused(f"{self.role} is refused by Knowledge: {outcome}")
             if outcome == "Timeout":
+                self._round_trip.in_vain()
                 self._lost()
             if deadline is not None and time.monotonic() > deadline:
                 raise BusError(
@@ -121,7 +124,7 @@ class Questions(ABC):
         if self._session is None:
             raise BusError(f"{self.role} is not connected; call connect()")
         self._session.get(
-            self.wire.ask(what), _UNHEARD, payload=payload, attachment=attachment, timeout=ANSWER_WITHIN, **ORDERED
+            self.wire.ask(what), _UNHEARD, payload=payload, attachment=attachment, timeout=self.wire.patience, **ORDERED
         )
 
     def keep_surely(self, state: State, table: QTable | None = None) -> None:

@@ -24,6 +24,8 @@ import json
 import os
 import re
 import socket
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +35,7 @@ from typing import Any
 import zenoh
 
 from adapters.buses import endpoints, security
+from adapters.buses.round_trip import RoundTrip
 from adapters.roles import KNOWLEDGE, OPERATOR, ROLES
 from knowledge import STAGES, ChangePlan, ChangeRequest, Observation, Record, Symptom
 from mape.errors import BusError, ConfigError
@@ -64,17 +67,36 @@ OF_CONFIG = "config: "
 """What a refusal begins with that is a matter of the config."""
 
 LEASE_MS = 2_000
-"""After that long a process that is frozen, or cut off, is taken for gone; one that died is seen at once."""
+"""After that long a process on this machine that is frozen is taken for gone; one that died is seen at once."""
+
+PATIENCE = 60.0
+"""Seconds for which an answer over a network may be waited for, at most, before it is asked for again."""
+
+LEASES = 6
+"""Over a network, a process that is frozen, or cut off, is taken for gone after this part of the patience."""
+
+PENDING = 1_000
+"""Most handshakes that Knowledge has under way at the same time; on a slow network each takes a while."""
 
 _SEGMENT = re.compile(r"[a-z0-9_-]+")
 
 
 class Unanswered(BusError):
-    """Nobody can be joined at an endpoint; `listens` tells whether somebody listens there all the same."""
+    """Nobody can be joined at an endpoint.
 
-    def __init__(self, said: str, listens: bool) -> None:
+    Attributes
+    ----------
+    found : who is there all the same, as far as can be seen; None where nobody listens.
+    """
+
+    def __init__(self, said: str, found: endpoints.Found | None) -> None:
         super().__init__(said)
-        self.listens = listens
+        self.found = found
+
+    @property
+    def slow(self) -> bool:
+        """Whether more patience may help."""
+        return self.found is not None and self.found.slow
 
 
 @dataclass(frozen=True)
@@ -91,6 +113,8 @@ class Wire:
         Folder with certificates, as `mapek keys` makes it: both ends then prove who they are.
     insecure
         Allow hosts beyond this one without certificates.
+    patience
+        Seconds for which an answer may be waited for, at most, before it is asked for again.
 
     Raises
     ------
@@ -108,6 +132,7 @@ class Wire:
     system: str
     tls: Path | None = None
     insecure: bool = False
+    patience: float = PATIENCE
 
     def __post_init__(self) -> None:
         if self.system != "*":
@@ -115,6 +140,13 @@ class Wire:
         endpoints.check_endpoint(self.endpoint, self.tls is not None or self.insecure)
         if self.tls is not None and self.endpoint.startswith(endpoints.UNIX):
             raise ConfigError(f"endpoint {self.endpoint!r} takes no keys; with --tls give tcp/HOST:PORT")
+
+    @property
+    def lease(self) -> float:
+        """Seconds after which a process that is frozen, or cut off, is taken for gone."""
+        if self.endpoint.startswith(endpoints.UNIX):
+            return LEASE_MS / 1000
+        return max(LEASE_MS / 1000, self.patience / LEASES)
 
     def stream(self, role: str, loop: int | str = "*") -> str:
         """Key on which a role's records are published."""
@@ -210,26 +242,50 @@ class Wire:
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
         }
-        return _open(self._config("client", role, connect=connect), lambda said: self._unanswered(endpoint, role, said))
+        return _open(
+            self._config("client", role, connect=connect),
+            lambda said: self._unanswered(endpoint, role, said, patience),
+        )
 
-    def _unanswered(self, endpoint: str, role: str, said: str) -> Unanswered:
+    def join_patiently(self, role: str, least: float) -> zenoh.Session:
+        """Open a client's session as `join` does; while only a slow network is in the way, again, with more time.
+
+        Raises
+        ------
+        Unanswered, ConfigError
+            As `join`; of a slow network after the patience.
+        """
+        patience, until = RoundTrip(self.patience), time.monotonic() + max(least, self.patience)
+        while True:
+            try:
+                return self.join(role, patience.within(least))
+            except Unanswered as error:
+                if not error.slow or time.monotonic() > until:
+                    raise
+                patience.in_vain()
+
+    def _unanswered(self, endpoint: str, role: str, said: str, patience: float) -> Unanswered:
         place, found = endpoints.place_of(endpoint), None
         if place is not None:
-            found = endpoints.who_listens(place, None if self.tls is None else security.authority_of(self.tls))
-        why = found or "start it, or look at the address"
+            authority = None if self.tls is None else security.authority_of(self.tls)
+            found = endpoints.who_listens(place, authority, patience)
+        why = found.why if found else "start it, or look at the address"
         if self.tls is not None and not found:
             why += f" and at whether it trusts the certificate of {role} in {self.tls}"
-        return Unanswered(f"no Knowledge answers on {self.endpoint}; {why} ({said})", found is not None)
+        return Unanswered(f"no Knowledge answers on {self.endpoint}; {why} ({said})", found)
 
     def _address(self, endpoint: str) -> str:
         return endpoint if self.tls is None else endpoint.replace("tcp/", "tls/", 1)
 
     def _config(self, mode: str, role: str, **edges: Any) -> zenoh.Config:
         quiet = {"enabled": False}
-        # A queue that stays full for the lease belongs to a process that is gone; Zenoh would close the link, and lose
-        # what waits, only after five seconds in which the sender is blocked.
-        blocked = {"congestion_control": {"block": {"wait_before_close": LEASE_MS * 1000}}}
-        link: dict[str, Any] = {"tx": {"lease": LEASE_MS, "queue": blocked}}
+        # A queue that stays full for the lease belongs to a process that is gone, on this machine; over a slow network
+        # it may just be long, and who is gone there is told by the lease alone.
+        lease, most = round(self.lease * 1000), round(self.patience * 1000)
+        far = not self.endpoint.startswith(endpoints.UNIX)
+        blocked = {"congestion_control": {"block": {"wait_before_close": (most if far else lease) * 1000}}}
+        link: dict[str, Any] = {"tx": {"lease": lease, "queue": blocked}}
+        handshakes = {"open_timeout": most, "accept_timeout": most, "accept_pending": PENDING}
         if self.tls is not None:
             link |= security.tls(self.tls, role)
         return zenoh.Config.from_json5(
@@ -240,7 +296,7 @@ class Wire:
                     # would wait half a second for what may answer.
                     "scouting": {"delay": 0, "multicast": quiet, "gossip": quiet},
                     # Shared memory outlives a killed process, and records are far below the size at which it pays.
-                    "transport": {"shared_memory": quiet, "link": link},
+                    "transport": {"shared_memory": quiet, "unicast": handshakes, "link": link},
                     # No clock enters what is logged.
                     "timestamping": quiet,
                     **edges,
@@ -306,11 +362,23 @@ def _open(config: zenoh.Config, otherwise: Callable[[str], BusError]) -> zenoh.S
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)  # read once, when the first session of a process is opened
     # Zenoh says nowhere else that it has closed a link.
     zenoh.init_log_from_env_or("error")
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
+    opened: list[zenoh.Session] = []
+    failed: list[zenoh.ZError] = []
+
+    def open_it() -> None:
+        try:
+            opened.append(zenoh.open(config))
+        except zenoh.ZError as error:
+            failed.append(error)
+
+    # On a thread of its own: over a slow network it takes its time, in which Ctrl-C and SIGTERM are to be heard.
+    thread = threading.Thread(target=open_it, name="open", daemon=True)
+    thread.start()
+    thread.join()
+    if failed:
         # Of what Zenoh says, the places in its sources help nobody here.
-        raise otherwise(re.split(r"[.]? at /", str(error))[0]) from error
+        raise otherwise(re.split(r"[.]? at /", str(failed[0]))[0]) from failed[0]
+    return opened[0]
 
 
 def never_freed(router: zenoh.Session) -> zenoh.Session:

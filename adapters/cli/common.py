@@ -119,8 +119,8 @@ def operator(chosen: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     """
     from adapters.buses.wire import Wire
 
-    wire = Wire(chosen.connect, "*", None if chosen.tls is None else Path(chosen.tls), chosen.insecure)
-    session = wire.join("operator", 3.0)
+    wire = Wire(chosen.connect, "*", None if chosen.tls is None else Path(chosen.tls), chosen.insecure, chosen.patience)
+    session = wire.join_patiently("operator", 3.0)
     try:
         yield session, wire
     finally:

@@ -122,6 +122,7 @@ def parser() -> argparse.ArgumentParser:
     _where_to(serve)
     _keeps(serve)
     _secure(serve)
+    _patient(serve)
     serve.add_argument("--log", metavar="FILE", help=argparse.SUPPRESS)
     serve.add_argument("--leash", action="store_true", help=argparse.SUPPRESS)
 
@@ -129,6 +130,7 @@ def parser() -> argparse.ArgumentParser:
     status.add_argument("--connect", required=True, metavar="ENDPOINT", help="where Knowledge listens")
     status.add_argument("--json", action="store_true", help="as JSON")
     _secure(status)
+    _patient(status)
 
     swap = commands.add_parser(
         "swap",
@@ -142,6 +144,7 @@ def parser() -> argparse.ArgumentParser:
     )
     swap.add_argument("--connect", required=True, metavar="ENDPOINT", help="where Knowledge listens")
     _secure(swap)
+    _patient(swap)
 
     log = commands.add_parser(
         "log",
@@ -291,6 +294,14 @@ def _secure(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--insecure", action="store_true", help="allow other machines without keys, where the network is trusted"
     )
+
+
+def _patient(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--patience", type=_seconds, default=60.0, metavar="S",
+        help="wait up to so long for one answer of a slow network; who says nothing for a sixth of it is away "
+        "(default 60)",
+    )  # fmt: skip
 
 
 def _seconds(text: str) -> float:

@@ -47,7 +47,7 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
             f"{'--listen' if knowledge else '--connect'} ENDPOINT, such as tcp/127.0.0.1:7447, and not the other"
         )
     tls = None if chosen.tls is None else Path(chosen.tls)
-    wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure)
+    wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure, chosen.patience)
     if tls is not None:
         _keep_standard_output()
     if not knowledge:

@@ -14,11 +14,14 @@ from adapters.roles import ROLES
 from knowledge import from_json
 from mape.errors import BusError
 
+ANSWERED_WITHIN = 15.0
+"""Seconds that Knowledge has to answer; over a good network it takes some milliseconds."""
+
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
     with operator(chosen) as (session, wire):
-        found = ask_status(session, wire, 5.0)
+        found = ask_status(session, wire, min(ANSWERED_WITHIN, wire.patience))
     if not found:
         raise BusError(f"Knowledge on {wire.endpoint} did not answer; with keys, only a role that it knows may ask")
     for status in found:

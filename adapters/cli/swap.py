@@ -11,6 +11,7 @@ from typing import Any
 import zenoh
 
 from adapters.buses.messages import Control, Replaced
+from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import Wire
 from adapters.cli.common import operator
 from adapters.processes.replacing import CHECKED_WITHIN
@@ -66,12 +67,18 @@ def _ask(role: str, control: Control, session: zenoh.Session, wire: Wire) -> zen
 
 def _epoch(role: str, session: zenoh.Session, wire: Wire) -> int | None:
     """Wait until a role is there, and tell which of its starts it is; None where it does not come."""
-    deadline = time.monotonic() + THERE_WITHIN
+    begun = time.monotonic()
+    deadline, patience = begun + THERE_WITHIN, RoundTrip(wire.patience)
     while True:
-        for status in ask_status(session, wire, 1.0):
+        asked_at, within = time.monotonic(), patience.within(1.0)
+        for status in ask_status(session, wire, within):
             if status.roles[role].alive:
                 return status.roles[role].epoch
-        if time.monotonic() > deadline:
+        now = time.monotonic()
+        if now - asked_at >= within:  # nobody has answered: the network may be slow
+            patience.in_vain()
+            deadline = min(now + 2 * within, begun + max(THERE_WITHIN, wire.patience))
+        if now > deadline:
             return None
         time.sleep(LOOK_EVERY)  # Knowledge tells who is there when it is asked
 

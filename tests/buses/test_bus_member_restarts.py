@@ -7,7 +7,7 @@ import pytest
 from bus_peers import Site, eventually, lose, of, play_part, received, status
 from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
-from adapters.buses import Member, inbox, member, outbox, questions
+from adapters.buses import Member, inbox, member, questions
 from adapters.buses.questions import Refused
 from adapters.roles import ROLES
 from knowledge import to_json
@@ -117,8 +117,7 @@ def test_dropped_episodes_are_said_and_a_reader_goes_past_them(wire, impatient, 
 
 
 def test_one_whose_link_stands_and_is_dead_opens_another_session(site, all_four, monkeypatch):
-    for module in (inbox, outbox):
-        monkeypatch.setattr(module, "ANSWER_WITHIN", 0.1)
+    monkeypatch.setattr(inbox, "ANSWER_WITHIN", 0.1)
     monkeypatch.setattr(member, "DEAF_AFTER", 0.1)
     raw, planner, heard = site.session(), all_four["plan"], threading.Event()
     site.send(plan(0))
@@ -141,7 +140,7 @@ def test_one_whose_link_stands_and_is_dead_opens_another_session(site, all_four,
 
 
 def test_one_that_waits_for_a_busy_knowledge_keeps_its_session(site, all_four, monkeypatch):
-    for module in (inbox, outbox, questions):
+    for module in (inbox, questions):
         monkeypatch.setattr(module, "ANSWER_WITHIN", 0.1)
     held, true_take = threading.Event(), site.ledger.take
     monkeypatch.setattr(site.ledger, "take", lambda *given: (held.wait(60), true_take(*given))[1])

@@ -92,8 +92,8 @@ def test_a_socket_left_behind_by_a_killed_knowledge_is_taken_over(endpoint, wire
 
 
 READER = f"""{BEGIN}
-    from adapters.buses import inbox, member, outbox, questions
-    for module in (inbox, outbox, questions):
+    from adapters.buses import inbox, member, questions
+    for module in (inbox, questions):
         module.ANSWER_WITHIN = 0.5
     member.DEAF_AFTER = 0.5
     with Member(wire, "monitor") as reader:

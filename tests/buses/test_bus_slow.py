@@ -5,7 +5,7 @@ import threading
 from bus_peers import Site
 from bus_records import run_of
 
-from adapters.buses import answers, inbox
+from adapters.buses import answers, inbox, outbox
 from adapters.buses.wire import INPUT
 from knowledge import STAGES, to_json
 
@@ -40,3 +40,21 @@ def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):
     questions = [number for number in asked if number <= passes]
     print(f"asked {len(questions)} times for {passes // limit} full answers: {questions}")
     assert len(questions) <= 2 * (passes // limit)
+
+
+def test_what_takes_its_time_is_sent_about_once(wire, monkeypatch):
+    """An answer that takes longer than the first patience is waited for from then on, and not asked for ever again."""
+    monkeypatch.setattr(outbox, "RESEND_AFTER", 0.02)
+    heard, slowly = [], threading.Event()
+    with Site(wire, begun=True) as site:
+        true_say, true_append = site.hub._say, site.hub.answers.append
+        monkeypatch.setattr(site.hub, "_say", lambda answer: (slowly.wait(0.3), true_say(answer)))
+        monkeypatch.setattr(
+            site.hub.answers, "append", lambda query: (heard.append(str(query.key_expr)), true_append(query))[1]
+        )
+        site.everybody()
+        for record in run_of(4):
+            site.send(record)
+    sent = len(run_of(4))
+    print(f"{sent} records were heard {len(heard)} times")
+    assert len(heard) < 2 * sent

@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import sys
 from contextlib import ExitStack, contextmanager
 
 from real_processes import EXAMPLES, ROLES, hashes, serve, until, write_config
@@ -100,5 +99,3 @@ def deployed(folder, table, *options, seed=0, **line):
     with ExitStack() as opened:
         switch = opened.enter_context(Switch(HOSTS, seed, **line))
         yield Deployment(folder, table, switch, opened, *options)
-
-

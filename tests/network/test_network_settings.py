@@ -1,10 +1,12 @@
 """Five roles over TLS join and go on, whatever the network is like, and come to what one process makes."""
 
+import subprocess
 import time
 
 import pytest
 from bad_networks import alone, deployed, grid
 from real_processes import passes, until
+from real_runs import MAPEK
 from user_space_switch import why_not
 
 REASON = why_not()
@@ -40,3 +42,18 @@ def test_all_roles_join_and_come_to_the_hashes_of_one_process(here, setting):
         found = run.end()
         print(f"{setting}: joined after {joined:.1f} s, done after {time.monotonic() - begun:.1f} s; {run.switch.seen}")
     assert found == alone(table)
+
+
+def test_who_looks_on_from_afar_is_answered_and_hears_nothing_that_is_false(here):
+    with deployed(here, grid(10), delay=0.5, jitter=0.05) as run:
+        run.start("knowledge")
+        until(lambda: "Knowledge listens" in run.served["knowledge"].said, "Knowledge to listen")
+        operator = [*run.switch.start("operator"), *MAPEK, "status", "--connect", run.endpoint, "--tls", str(run.keys)]
+        done = subprocess.run(operator, capture_output=True, text=True, timeout=200, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "0 of 10 passes" in done.stdout
+        assert "uses no keys" not in done.stderr
+        # One that is too impatient is told that the network is slow, and not that keys are wrong.
+        done = subprocess.run([*operator, "--patience", "1"], capture_output=True, text=True, timeout=200, check=False)
+        assert done.returncode == 1
+        assert "uses no keys" not in done.stderr

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import pytest
 from user_space_switch import Switch, why_not
@@ -28,29 +29,32 @@ sys.exit(back != data)
 """
 
 
+@contextmanager
+def listening_there(switch):
+    with subprocess.Popen([*switch.start("there"), sys.executable, "-c", LISTEN], stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout.readline() == b"listens\n"
+            yield process
+        finally:
+            process.kill()
+
+
 def test_what_tcp_sends_over_a_bad_line_comes_whole():
-    with Switch(["here", "there"], delay=0.005, jitter=0.005, loss=0.05, twice=0.1, late=0.1, rate=1e6) as switch:
-        with subprocess.Popen(
-            [*switch.start("there"), sys.executable, "-c", LISTEN], stdout=subprocess.PIPE
-        ) as listening:
-            assert listening.stdout.readline() == b"listens\n"
-            sender = [*switch.start("here"), sys.executable, "-c", SEND, switch.addresses["there"]]
-            assert subprocess.run(sender, timeout=100).returncode == 0
-            assert listening.wait(60) == 0
+    bad = {"delay": 0.005, "jitter": 0.005, "loss": 0.05, "twice": 0.1, "late": 0.1, "rate": 1e6}
+    with Switch(["here", "there"], **bad) as switch, listening_there(switch) as listening:
+        sender = [*switch.start("here"), sys.executable, "-c", SEND, switch.addresses["there"]]
+        assert subprocess.run(sender, timeout=100).returncode == 0
+        assert listening.wait(60) == 0
     assert all(switch.seen[what] for what in ("passed", "lost", "late"))
 
 
 def test_nothing_passes_a_line_that_is_cut():
-    with Switch(["here", "there"]) as switch:
-        with subprocess.Popen(
-            [*switch.start("there"), sys.executable, "-c", LISTEN], stdout=subprocess.PIPE
-        ) as listening:
-            assert listening.stdout.readline() == b"listens\n"
-            switch.lines["there", "here"].cut = True  # one way is enough
-            sender = [*switch.start("here"), sys.executable, "-c", SEND, switch.addresses["there"]]
-            with subprocess.Popen(sender) as sending:
-                while switch.seen["cut"] < 2:  # as many answers to who knocks, again
-                    assert sending.poll() is None
-                switch.lines["there", "here"].cut = False
-                assert sending.wait(100) == 0
-            assert listening.wait(60) == 0
+    with Switch(["here", "there"]) as switch, listening_there(switch) as listening:
+        switch.lines["there", "here"].cut = True  # one way is enough
+        sender = [*switch.start("here"), sys.executable, "-c", SEND, switch.addresses["there"]]
+        with subprocess.Popen(sender) as sending:
+            while switch.seen["cut"] < 2:  # as many answers to who knocks, again
+                assert sending.poll() is None
+            switch.lines["there", "here"].cut = False
+            assert sending.wait(100) == 0
+        assert listening.wait(60) == 0

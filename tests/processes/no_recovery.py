@@ -31,7 +31,7 @@ def no_catching_up(join):
 CUTS = {
     "state": lambda: setattr(role.Role, "_restore", no_state),
     "catching-up": lambda: setattr(member.Member, "_join", no_catching_up(member.Member._join)),
-    "sending-again": lambda: setattr(outbox.Outbox, "_send_again", lambda self, loop: None),
+    "sending-again": lambda: setattr(outbox.Outbox, "_send_again", lambda self, *given: None),
 }
 
 
