@@ -9,6 +9,8 @@
     |-- BusError             a record that could not be sent or delivered
     `-- ResultsError         a results folder that is taken, truncated, of another config, or cannot be written
 
+    Stop                     somebody wants this process to end; no error, and no Exception
+
 Each message names the value, what is legal, and the way out. The CLI prints it as one paragraph and exits with 1,
 or with 2 for a ConfigError.
 """
@@ -23,6 +25,10 @@ from mape.near import did_you_mean, nearest
 
 class MapekError(Exception):
     """Base of all errors that are raised on purpose."""
+
+
+class Stop(BaseException):
+    """Somebody wants this process to end, as by a signal: raised through whatever runs, by no fault of it."""
 
 
 class ConfigError(MapekError):

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from mape.config_files import examples
 from mape.errors import ConfigError, UnknownName
 from mape.specs import PartSpec, explain
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 
 class Entry(NamedTuple):
@@ -32,6 +32,16 @@ PARTS: dict[str, dict[str, Entry]] = {
         "two_window": Entry("mape.monitor.two_window:TwoWindow", "z-test of two sliding windows, both sides"),
         "oracle": Entry(
             "mape.monitor.oracle:Oracle", "alarms at the episodes it is given; bounds detection, not return"
+        ),
+        # Of the adapters, by name alone: a config means the same to a program of one's own and to the command.
+        "river": Entry(
+            "adapters.detectors.river_detector:RiverDetector",
+            "any drift detector of River by name; DDM, EDDM, HDDMA, HDDMW take 1 as an error (invert = true for a "
+            "return of 0 and 1); needs the package river",
+        ),
+        "adwin": Entry(
+            "adapters.detectors.river_detector:Adwin",
+            "River's ADWIN: adaptive window, both sides; needs the package river",
         ),
     },
     "analyzer": {
@@ -71,7 +81,7 @@ VALUES: dict[str, tuple[str, ...]] = {
 
 
 def register(kind: str, name: str, target: str, summary: str) -> None:
-    """Give a part a short name; for adapters, at import."""
+    """Give a part a short name."""
     PARTS.setdefault(kind, {})[name] = Entry(target, summary)
 
 
@@ -103,7 +113,7 @@ def import_for(named: str, module_name: str) -> ModuleType:
                 "(installed packages, PYTHONPATH)"
             ) from None
         raise ConfigError(f"{named} needs the package {error.name!r}, which is not installed") from error
-    except FAULTS as error:
+    except faults() as error:
         raise ConfigError(f"{named}: its module raised {told(error)}") from error
 
 
@@ -196,7 +206,7 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
         missing = [value for value in VALUES.get(kind, ()) if not hasattr(made, value)]
     except ConfigError:
         raise
-    except FAULTS as error:
+    except faults() as error:
         raise ConfigError(
             f"{kind} {spec.name!r} cannot be made with {options or 'no options'}: {told(error)}"
         ) from error

@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
-from mape.errors import PartError
+from mape.errors import PartError, Stop
 from mape.ports import Json
 
-FAULTS = (Exception, SystemExit)
-"""What a part or a managed system raises by its own fault, and what the loop turns into an error that names it.
+STOPS = (KeyboardInterrupt, GeneratorExit, Stop)
+"""What is raised through a part or a managed system by no fault of its own.
 
-An exit is one of them: code of the user's, a simulator among it, ends no run. KeyboardInterrupt is none, for it is a
-Ctrl-C, in whatever code it was heard.
+All else is a fault, and becomes an error that names the part, whether it is an Exception or not: an exit, for code of
+the user's, a simulator among it, ends no run; a panic of code in Rust, whose class nobody can name beforehand.
 """
+
+
+def faults() -> tuple[type[BaseException], ...]:
+    """Return the class of what is just being raised, to stand in an ``except``; none where it is one of `STOPS`.
+
+    >>> try:
+    ...     raise SystemExit(3)
+    ... except faults() as error:
+    ...     print(told(error))
+    SystemExit: 3
+    """
+    raised = sys.exception()
+    return () if raised is None or isinstance(raised, STOPS) else (type(raised),)
 
 
 def told(error: BaseException) -> str:
@@ -85,7 +99,7 @@ def _call(kind: str, part: Any, method: str, *arguments: Any) -> Any:
         )
     try:
         return getattr(part, method)(*arguments)
-    except FAULTS as error:
+    except faults() as error:
         of = f" of {arguments[0]!r}" if arguments else ""
         raise PartError(
             f"{kind} {name} raised {told(error)}, at {method}(){of}. Mend it, and run `mapek check` on it."

@@ -16,7 +16,7 @@ from mape.monitor import Monitor
 from mape.parts import make, owner, parts_in, place_of, with_part
 from mape.plan import Plan
 from mape.specs import PartSpec
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 Component = Monitor | Analyze | Plan | Execute
 
@@ -78,7 +78,7 @@ def replace_part(
         return handed_over
     except MapekError:
         raise
-    except FAULTS as error:
+    except faults() as error:
         raise PartError(
             f"{spec.name!r} cannot take the place of {part}: {told(error)}. The old one goes on; run "
             "`mapek check` on the new one."

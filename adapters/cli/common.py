@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from adapters import detectors
 from adapters.cli.main import OutputError
 from adapters.experiments.runner import Checked, announce_compilation, check
 from adapters.experiments.statistics import finite
@@ -31,10 +30,9 @@ from mape.tables import parse_override
 
 
 def prepare() -> None:
-    """Make the adapters' parts known by name, long compilations heard, and the end of the process quick."""
+    """Make long compilations heard, and the end of the process quick."""
     # Python looks for garbage a last time, among all that Numba keeps, which takes longer than many a run.
     atexit.register(gc.freeze)
-    detectors.register()
     announce_compilation()
 
 

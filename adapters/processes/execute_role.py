@@ -18,6 +18,7 @@ from mape.execute import Execute
 from mape.execute.adoption import fitting
 from mape.execute.checkpoint import carried_by, take_up
 from mape.loop import build_execute
+from mape.states import faults
 
 HEARD_AT_LEAST = 0.002
 """Seconds between two episodes in which plans are put in force, even if the next one is due."""
@@ -180,7 +181,7 @@ class ExecuteRole(Role):
         try:
             handed_over = self._replace(unit, wanted.part, wanted.spec)
             self.drive(unit)
-        except Exception as error:  # whatever a learner of the user's does, the old one goes on
+        except faults() as error:  # whatever a learner of the user's does, the old one goes on
             unit.outbox.clear()
             execute.replace(old)
             unit.config = config

@@ -27,7 +27,7 @@ from mape.errors import BusError, ConfigError, MapekError, PartError
 from mape.execute.adoption import check_actions, fitting
 from mape.parts import owner, with_part
 from mape.specs import PartSpec
-from mape.states import told
+from mape.states import faults, told
 from mape.swap import replace_part, vet
 
 logger = logging.getLogger(__name__)
@@ -209,7 +209,7 @@ class Replacing(ABC):
             handed_over = self._replace(unit, wanted.part, wanted.spec)
             self._handle(unit, record)
             self._check(unit, record)
-        except Exception as error:  # whatever a part of the user's does, the old one goes on
+        except faults() as error:  # whatever a part of the user's does, the old one goes on
             unit.outbox.clear()
             put_back()
             if before is not None:

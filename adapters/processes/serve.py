@@ -23,7 +23,7 @@ from adapters.processes.supervise import ENDS_WITHIN
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
 from mape.config import Config
-from mape.errors import PartError, ResultsError
+from mape.errors import PartError, ResultsError, Stop
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ LEFT_WITHIN = 5.0
 """Seconds that the roles of a complete run have to leave before Knowledge does."""
 
 
-class Terminated(BaseException):
+class Terminated(Stop):
     """SIGTERM came."""
 
 

@@ -12,7 +12,6 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters import detectors
 from adapters.results.files import read_json, read_npz, whole, write_json
 from adapters.results.table import DTYPE, from_rows, write_npz
 from adapters.systems.lending import Lender
@@ -60,7 +59,6 @@ def run_chunk(
         The results could not be written: nothing of this chunk stays. Or a unit failed: those before it are stored as
         a chunk, and its own finished passes as ``broken-UNIT.npz`` beside it.
     """
-    detectors.register()  # a worker process knows no adapters of its own
     config = from_table(json.loads(config_json))
     results: list[TrialResult] = []
     arrays: dict[str, npt.NDArray[Any]] = {}

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from adapters.systems.gymnasium_system import GymnasiumSystem, connect, make_env, make_system, rules_of
 from managed_systems import register_envs
 from mape.config import BoxGrid, SystemConfig
-from mape.states import FAULTS, told
+from mape.states import faults, told
 from mape.testing import Finding, check_plant, check_system
 from mape.testing.systems import EPISODES
 
@@ -97,7 +97,7 @@ def check_environment(config: SystemConfig) -> Finding:
             warnings.simplefilter("always")
             connect(env)
             check_env(env.unwrapped, skip_render_check=True)
-    except FAULTS as error:
+    except faults() as error:
         return Finding(CHECK_ENV, "failed", told(error))
     finally:
         env.close()

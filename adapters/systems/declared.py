@@ -10,7 +10,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from managed_systems import register_envs
 from mape.config import SystemConfig
-from mape.states import FAULTS
+from mape.states import faults
 
 
 def declared(config: SystemConfig, name: str) -> Any:
@@ -25,7 +25,7 @@ def declared(config: SystemConfig, name: str) -> Any:
             importlib.import_module(module)
         entry_point = gymnasium.spec(env_id).entry_point
         return getattr(load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point, name, None)
-    except FAULTS:
+    except faults():
         return None
 
 

@@ -20,7 +20,7 @@ from managed_systems.rules import available
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 _RULES = tuple(name for name in vars(StepRules) if not name.startswith("_"))
 
@@ -72,7 +72,7 @@ def _make_by_id(config: SystemConfig) -> gymnasium.Env[Any, Any]:
         raise ConfigError(
             f"system {config.id!r} needs the module {name!r}, which is neither installed nor in this folder"
         ) from error
-    except FAULTS as error:
+    except faults() as error:
         raise refusal(config, error) from error
 
 
@@ -254,7 +254,7 @@ class GymnasiumSystem:
     def _connect(self, number: int) -> None:
         try:
             connect(self.env)
-        except FAULTS as error:
+        except faults() as error:
             raise ManagedSystemError(
                 f"{self.name} raised {told(error)}, when it was to connect before episode {number}. The {number - 1} "
                 "passes before it stand in the log."

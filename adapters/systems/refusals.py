@@ -10,7 +10,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from mape.config import SystemConfig
 from mape.errors import ConfigError, UnknownName
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 
 def refusal(config: SystemConfig, error: BaseException) -> ConfigError:
@@ -33,7 +33,7 @@ def _options_of(identifier: str) -> list[str] | None:
     try:
         made: Any = gymnasium.spec(identifier.rpartition(":")[2]).entry_point
         parameters = inspect.signature(load_env_creator(made) if isinstance(made, str) else made).parameters.values()
-    except FAULTS:  # of a module that cannot be imported; of a creator that has no signature
+    except faults():  # of a module that cannot be imported; of a creator that has no signature
         return None
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return None

@@ -22,7 +22,7 @@ from managed_systems import drawing
 from managed_systems.environment import RulesEnvironment
 from managed_systems.rules import ALWAYS, FloatArray, IntArray, Rules
 from mape.errors import ConfigError
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 WITH_TABLE = ("CliffWalking-v1", "CliffWalkingSlippery-v1", "FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4")
 """Gymnasium's own ids that show their table."""
@@ -281,7 +281,7 @@ def _mask(base: Any, n_states: int, n_actions: int, name: str) -> npt.NDArray[np
         return np.ones((n_states, n_actions), np.bool_)
     try:
         mask = np.array([base.action_mask(state) for state in range(n_states)], np.bool_)
-    except FAULTS as error:  # whatever it is that somebody else calls so
+    except faults() as error:  # whatever it is that somebody else calls so
         raise ConfigError(f"action_mask(state) of {name} gives no marks: {told(error)}") from error
     if mask.shape != (n_states, n_actions):
         raise ConfigError(

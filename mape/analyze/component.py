@@ -7,7 +7,7 @@ from collections.abc import Callable
 from knowledge import ChangeRequest, Symptom
 from mape.errors import PartError
 from mape.ports import Analyzer, Json
-from mape.states import FAULTS, hand_over, restore, state_of, told
+from mape.states import faults, hand_over, restore, state_of, told
 
 
 class Analyze:
@@ -35,7 +35,7 @@ class Analyze:
         """
         try:
             request = self.analyzer.analyze(symptom)
-        except FAULTS as error:
+        except faults() as error:
             raise PartError(
                 f"analyzer {type(self.analyzer).__name__} raised {told(error)}, at pass {symptom.pass_no}"
             ) from error

@@ -9,7 +9,7 @@ from knowledge import ChangePlan, Knowledge, QTable
 from mape.errors import ManagedSystemError, PartError
 from mape.execute.rules import rate_array
 from mape.ports import Learner, ManagedSystem
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 
 def fitting(plan: ChangePlan, known: tuple[int, ...]) -> ChangePlan:
@@ -121,7 +121,7 @@ def enable(plan: ChangePlan, system: ManagedSystem) -> None:
         system.enable(plan.enable)
     except ValueError as error:
         raise PartError(f"plan {plan.pass_no} cannot be executed: {error}") from error
-    except FAULTS as error:
+    except faults() as error:
         raise ManagedSystemError(
             f"{system.name} raised {told(error)}, while it enabled the actions {plan.enable} of plan {plan.pass_no}"
         ) from error

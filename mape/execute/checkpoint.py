@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from knowledge import ChangePlan, from_json, to_json
 from mape.errors import ManagedSystemError, PartError
 from mape.ports import Json, ManagedSystem
-from mape.states import FAULTS, told
+from mape.states import faults, told
 
 
 class Checkpoint(NamedTuple):
@@ -70,7 +70,7 @@ def carried_by(system: ManagedSystem) -> Json:
     """
     try:
         return system.get_state()
-    except FAULTS as error:
+    except faults() as error:
         raise ManagedSystemError(f"{system.name} raised {told(error)}, when it was asked for its state") from error
 
 
@@ -87,7 +87,7 @@ def take_up(system: ManagedSystem, carried: Json, enabled: tuple[int, ...]) -> N
             system.set_state(carried)
         elif enabled:
             system.enable(enabled)
-    except FAULTS as error:
+    except faults() as error:
         raise ManagedSystemError(
             f"{system.name} raised {told(error)}, when it was to go on from the state {carried} with "
             f"the actions {enabled} enabled; give it the state of a system of the same config"

@@ -18,7 +18,7 @@ from mape.execute.rules import rate_array
 from mape.execute.uniforms import Uniforms
 from mape.execute.workspace import Workspace
 from mape.ports import Episode, Json, Learner, ManagedSystem
-from mape.states import FAULTS, told
+from mape.states import STOPS, faults, told
 
 SIGNALS = ("return", "steps", "td_error", "q_change")
 """Signals of every run: return, steps, mean |TD error|, largest absolute change of Q; the system's own follow."""
@@ -208,7 +208,7 @@ class Execute:
             status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
         except BaseException as error:
             self._workspace.roll_back()
-            if isinstance(error, MapekError) or not isinstance(error, FAULTS):
+            if isinstance(error, (MapekError, *STOPS)):
                 raise
             if (steps := int(self._workspace.used[1])) < 0:
                 raise self._failed_to_reset(error, number) from error
@@ -390,7 +390,7 @@ class Execute:
             self._called.state, available = self.system.begin(told)
         except MapekError:
             raise
-        except FAULTS as error:
+        except faults() as error:
             raise self._failed_to_reset(error, number) from error
         # One object as long as nothing changes: what compares by identity is cheap downstream.
         return self.available if available == self.available else available

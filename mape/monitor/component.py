@@ -9,7 +9,7 @@ from knowledge import Observation, Reading, Symptom
 from knowledge.rows import DIRECTIONS
 from mape.errors import PartError
 from mape.ports import Detector, Json
-from mape.states import FAULTS, hand_over, restore, state_of, told
+from mape.states import faults, hand_over, restore, state_of, told
 
 _new = tuple.__new__  # half the cost of a named tuple's own constructor, on the hot path
 
@@ -55,7 +55,7 @@ class Monitor:
                 reading = _new(Reading, (name, value, statistic, alarm, detector.direction))
                 if alarm:
                     detector.reset()
-            except FAULTS as error:
+            except faults() as error:
                 raise self._failed(name, detector, seen, error) from error
             readings += (reading,)
         self._send(_new(Symptom, (loop, number, signals, available, known, readings)))

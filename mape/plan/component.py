@@ -9,7 +9,7 @@ from knowledge import ChangePlan, ChangeRequest, Knowledge
 from mape.errors import PartError
 from mape.ports import Json, Planner, Schedule
 from mape.specs import PartSpec
-from mape.states import FAULTS, hand_over, restore, state_of, told
+from mape.states import faults, hand_over, restore, state_of, told
 
 _NO_ACTIONS: tuple[int, ...] = ()
 
@@ -53,7 +53,7 @@ class Plan:
         """
         try:
             plan = self.planner.plan(request, self._knowledge)
-        except FAULTS as error:
+        except faults() as error:
             raise self._failed(request.pass_no, error) from error
         self._check(plan, request.pass_no)
         self._knowledge.plan = plan
@@ -136,7 +136,7 @@ class Plan:
     def _started(self, loop: int) -> ChangePlan:
         try:
             plan = self.planner.start(loop)
-        except FAULTS as error:
+        except faults() as error:
             raise self._failed(0, error) from error
         self._check(plan, 0)
         return plan

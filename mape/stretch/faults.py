@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mape import states
 from mape.compose import Composed, Uncompilable, specialise
 from mape.errors import PartError
 from mape.ports import QuietRule
@@ -102,7 +103,7 @@ def _reaches_beyond(plain: Any, rule: QuietRule, told: Any) -> bool:
             plain([float(number) for number in rule.state], tuple(float(number) for number in rule.params), told)
     except IndexError:
         return True
-    except Exception:
+    except states.faults():
         return False  # the user's rule, on signals that are not the run's: what it raises on its own, the run tells
     return False
 

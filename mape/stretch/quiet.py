@@ -8,6 +8,7 @@ from typing import Any
 from mape.compose import Composed, Rule
 from mape.errors import PartError
 from mape.ports import QuietRule
+from mape.states import faults, told
 
 # Bound by `mape.compose`.
 schedule_rule: Any = None
@@ -30,9 +31,9 @@ def quiet_of(part: Any) -> QuietRule | None:
         rule = part.quiet
     except PartError:
         raise  # its schedule's
-    except Exception as error:
+    except faults() as error:
         raise PartError(
-            f"{type(part).__name__} raised {type(error).__name__}: {error}, when it was asked for its rule (quiet). "
+            f"{type(part).__name__} raised {told(error)}, when it was asked for its rule (quiet). "
             "Mend it, or choose the engine 'python', which asks for none."
         ) from error
     return rule if isinstance(rule, QuietRule) else None

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from knowledge import ChangePlan, ChangeRequest, Knowledge, Observation, QTable, Reading, Symptom
 from knowledge.log import Pass
 from knowledge.rows import NEXT_EPSILON, SIDES, SIGNALS, UNKNOWN
+from mape import states
 from mape.analyze import Analyze
 from mape.compose import Composed, Rule, Uncompilable, specialise
 from mape.execute import Execute
@@ -230,7 +231,7 @@ def _has_none(detector: Detector) -> bool:
     """Whether a detector has no statistic; one that cannot say so before its first value may have one."""
     try:
         return detector.statistic is None
-    except Exception:  # it is read after each value, and what it raises then is told
+    except states.faults():  # it is read after each value, and what it raises then is told
         return False
 
 

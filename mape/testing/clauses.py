@@ -14,7 +14,7 @@ from knowledge import (
     to_json,
 )
 from mape.errors import PartError
-from mape.states import FAULTS
+from mape.states import faults
 
 
 class Finding(NamedTuple):
@@ -85,7 +85,7 @@ def outcome(check: str, clause: Callable[[], None]) -> Finding:
         return Finding(check, "failed", str(broken))
     except Noted as note:
         return Finding(check, "note", str(note))
-    except FAULTS as error:
+    except faults() as error:
         text = f": {error}" if str(error) else ""
         return Finding(check, "failed", f"{type(error).__name__} was raised{text}")
     return Finding(check, "ok")

@@ -1,11 +1,13 @@
 import json
 import random
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from river import drift
 
-from adapters.detectors import register
+from adapters.cli.main import main
 from adapters.detectors.river_detector import Adwin, AdwinConfig, RiverConfig, RiverDetector, _classes
 from adapters.systems import make_system
 from mape import registry
@@ -13,12 +15,6 @@ from mape.config import DetectorSpec, from_table
 from mape.errors import ConfigError, PartError
 from mape.loop import Loop
 from mape.testing import check_detector, require
-
-
-@pytest.fixture(autouse=True)
-def registered(monkeypatch):
-    monkeypatch.setitem(registry.PARTS, "detector", dict(registry.PARTS["detector"]))
-    register()
 
 
 def build(name="river", **options):
@@ -194,12 +190,29 @@ def test_without_river_the_error_says_how_to_install_it(name, monkeypatch):
         _classes.cache_clear()
 
 
-def test_registering_twice_changes_nothing():
-    before = dict(registry.PARTS["detector"])
-    register()
-    assert registry.PARTS["detector"] == before
-    assert registry.find("detector", "river") is RiverDetector
-    assert registry.find("detector", "adwin") is Adwin
+PROGRAM = """
+from adapters.systems import make_system
+from mape.config import from_table
+from mape.trials import run_trial
+
+detectors = ["adwin", {"name": "river", "detector": "PageHinkley"}]
+config = from_table({"episodes": 3, "system": {"id": "mapek/Gridworld-v0"}, "monitor": {"detectors": detectors}})
+print(run_trial(config, 0, make_system).passes)
+"""
+
+
+def test_a_program_of_ones_own_knows_the_short_names_as_the_command_does():
+    ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=120)
+    assert (ran.stdout, ran.stderr) == ("3\n", "")
+
+
+def test_a_panic_of_rust_is_a_sentence_that_names_the_part(tmp_path, capfd):
+    detectors = 'monitor.detectors=[{name="river", detector="ADWIN", options={clock=0}}]'
+    config = Path(__file__).parents[2] / "examples" / "gridworld_goals.toml"
+    options = ["--set", detectors, "--quiet", "--no-figures", "--out", str(tmp_path / "out")]
+    assert main(["run", str(config), "--set", "episodes=5", *options]) == 1
+    (said,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("mapek: ")]
+    assert "detector RiverDetector raised PanicException" in said
 
 
 def test_a_detector_is_made_by_hand_too():

@@ -7,19 +7,12 @@ import pytest
 from gymnasium import Env, register
 from gymnasium.spaces import Discrete
 
-from adapters.detectors import register as register_detectors
 from adapters.detectors.river_detector import AdwinConfig, RiverConfig, RiverDetector
 from adapters.systems import make_system
 from mape import registry
 from mape.config import DetectorSpec, from_table
 from mape.parts import cautions
 from mape.trials import run_trial
-
-
-@pytest.fixture(autouse=True)
-def registered(monkeypatch):
-    monkeypatch.setitem(registry.PARTS, "detector", dict(registry.PARTS["detector"]))
-    register_detectors()
 
 
 def build(name, **options):

@@ -1,4 +1,7 @@
-"""A part or a system that ends the program, by `sys.exit()`, has failed; only a Ctrl-C ends a run."""
+"""A part or a system that ends the program by `sys.exit()`, or raises what is no Exception, has failed.
+
+Only who wants the run to end, as by a Ctrl-C, ends it.
+"""
 
 import sys
 from types import SimpleNamespace
@@ -7,7 +10,7 @@ import pytest
 from mape_runs import Corridor, config, corridor_loop, hashes, loop_of
 
 from mape.analyze.changes import Changes
-from mape.errors import ManagedSystemError, PartError
+from mape.errors import ManagedSystemError, PartError, Stop
 from mape.execute.rules import QLearning
 from mape.monitor.page_hinkley import PageHinkley
 from mape.plan.morphin import Morphin
@@ -16,50 +19,69 @@ from mape.swap import vet
 from mape.testing import CHECKS
 
 
+class Panic(BaseException):
+    """As code in Rust raises it: of a class that nobody can import beforehand."""
+
+
+class Raised:
+    kind: type[BaseException] = SystemExit
+
+
+EITHER = "(SystemExit|Panic)"
+
+
+def leave(*code):
+    raise Raised.kind(*code)
+
+
 class Detector(PageHinkley):
     def update(self, x):
-        sys.exit(5)
+        leave(5)
 
 
 class Analyzer(Changes):
     def analyze(self, symptom):
-        sys.exit(5)
+        leave(5)
 
 
 class Planner(Morphin):
     def plan(self, request, knowledge):
-        sys.exit(5)
+        leave(5)
 
 
 class Starter(Morphin):
     def start(self, loop):
-        sys.exit(5)
+        leave(5)
 
 
 class Forgetful(Morphin):
     def state(self):
-        sys.exit(5)
+        leave(5)
 
 
 def ends(td_error, rate):
-    raise SystemExit(5)
+    leave(5)
 
 
 class Learner(QLearning):
     step_size = staticmethod(ends)
 
 
-@pytest.fixture(autouse=True)
-def own(monkeypatch):
+@pytest.fixture(autouse=True, params=[SystemExit, Panic])
+def own(monkeypatch, request):
+    monkeypatch.setattr(Raised, "kind", request.param)
     classes = (Detector, Analyzer, Planner, Starter, Learner, Forgetful)
     monkeypatch.setitem(sys.modules, "own", SimpleNamespace(**{each.__name__: each for each in classes}))
 
 
 PARTS = [
-    ({"monitor": {"detectors": [{"name": "own:Detector"}]}}, "detector Detector raised SystemExit: 5, at pass 1"),
-    ({"analyze": {"name": "own:Analyzer"}}, "analyzer Analyzer raised SystemExit: 5, at pass 1"),
-    ({"plan": {"name": "own:Planner"}}, "planner Planner raised SystemExit: 5, at pass 1"),
-    ({"plan": {"name": "own:Starter"}}, "planner Starter raised SystemExit: 5, at its start"),
+    (
+        {"monitor": {"detectors": [{"name": "own:Detector"}]}},
+        f"detector Detector raised {EITHER}: 5, at pass 1",
+    ),
+    ({"analyze": {"name": "own:Analyzer"}}, f"analyzer Analyzer raised {EITHER}: 5, at pass 1"),
+    ({"plan": {"name": "own:Planner"}}, f"planner Planner raised {EITHER}: 5, at pass 1"),
+    ({"plan": {"name": "own:Starter"}}, f"planner Starter raised {EITHER}: 5, at its start"),
 ]
 
 
@@ -69,23 +91,38 @@ def test_a_part_that_exits_is_named(over, says):
         loop_of(config(execute={"engine": "python"}, **over)).run(2)
 
 
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, GeneratorExit, Stop])
+def test_who_wants_the_run_to_end_is_no_fault_of_a_part(stop, monkeypatch):
+    monkeypatch.setattr(Raised, "kind", stop)
+    for over, _ in PARTS:
+        with pytest.raises(stop):
+            loop_of(config(execute={"engine": "python"}, **over)).run(2)
+    with pytest.raises(stop):
+        corridor_loop(Corridor(spoil=exits_at(5, 4, 2))).run(5)
+
+
 def test_an_exit_when_a_part_is_asked_for_its_state_is_told():
     loop = loop_of(config(plan={"name": "own:Forgetful"}))
-    with pytest.raises(PartError, match=r"planner Forgetful raised SystemExit: 5, at state\(\)"):
+    with pytest.raises(PartError, match=rf"planner Forgetful raised {EITHER}: 5, at state\(\)"):
         loop.plan.state()
 
 
 def exits_at(code, episode, step):
     def spoil(e, s):
         if (e, s) == (episode, step):
-            sys.exit(code)
+            leave(*([] if code is None else [code]))
         return {}
 
     return spoil
 
 
 @pytest.mark.parametrize(
-    ("code", "says"), [(5, "raised SystemExit: 5, in"), (None, "raised SystemExit, in"), ("bye", "SystemExit: bye, in")]
+    ("code", "says"),
+    [
+        (5, f"raised {EITHER}: 5, in"),
+        (None, f"raised {EITHER}, in"),
+        ("bye", f"{EITHER}: bye, in"),
+    ],
 )
 def test_a_system_that_exits_in_a_step_is_named_and_nothing_of_the_episode_is_learnt(code, says):
     before = corridor_loop()
@@ -99,15 +136,15 @@ def test_a_system_that_exits_in_a_step_is_named_and_nothing_of_the_episode_is_le
 def test_a_system_that_exits_at_its_reset_is_named():
     def offers(episode):
         if episode == 4:
-            sys.exit()
+            leave()
         return 0, 1
 
-    with pytest.raises(ManagedSystemError, match="corridor raised SystemExit, at the reset of episode 4"):
+    with pytest.raises(ManagedSystemError, match=f"corridor raised {EITHER}, at the reset of episode 4"):
         corridor_loop(Corridor(offers=offers)).run(5)
 
 
 def test_a_learner_that_exits_in_an_episode_is_an_error_of_that_episode():
-    with pytest.raises(ManagedSystemError, match="raised SystemExit: 5, in episode 1"):
+    with pytest.raises(ManagedSystemError, match=f"raised {EITHER}: 5, in episode 1"):
         loop_of(config(execute={"engine": "python"}, learner={"name": "own:Learner"})).run(2)
 
 
@@ -117,8 +154,8 @@ def test_a_system_that_exits_between_two_episodes_is_named(method):
     loop.run(2)
     state, table = loop.execute.state()
     state |= {"system": 1} if method == "set_state" else {"enabled": [2]}
-    setattr(loop.system, method, lambda *_: sys.exit(5))
-    with pytest.raises(ManagedSystemError, match="corridor raised SystemExit: 5"):
+    setattr(loop.system, method, lambda *_: leave(5))
+    with pytest.raises(ManagedSystemError, match=f"corridor raised {EITHER}: 5"):
         loop.execute.state() if method == "get_state" else loop.execute.restore(state, table)
 
 
@@ -133,9 +170,9 @@ def test_a_check_and_a_vetting_find_a_part_that_exits(kind, part, exits):
         return Planner(Planner.Config(), schedule=_schedule()) if kind == "planner" else exits(exits.Config())
 
     failed = [finding for finding in CHECKS[kind](make) if finding.verdict == "failed"]
-    assert "SystemExit was raised: 5" in failed[0].detail
+    assert f"{Raised.kind.__name__} was raised: 5" in failed[0].detail
     faults = vet(part, PartSpec(name=f"own:{exits.__name__}"), config())
-    assert "SystemExit was raised: 5" in faults[0]
+    assert f"{Raised.kind.__name__} was raised: 5" in faults[0]
 
 
 def _schedule():
@@ -146,7 +183,7 @@ def _schedule():
 
 def test_a_swap_to_a_part_that_exits_at_its_start_leaves_the_old_one():
     loop = loop_of(config(swap=[{"pass": 3, "part": "plan", "to": "own:Starter"}]))
-    with pytest.raises(PartError, match="planner Starter raised SystemExit: 5"):
+    with pytest.raises(PartError, match=f"planner Starter raised {EITHER}: 5"):
         loop.run(5)
     assert type(loop.plan.planner) is Morphin
     assert loop.log.passes == 2

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mape_runs import GRID, TRAFFIC, config, hashes, loop_of
 
-from adapters import detectors
 from mape import registry
 from mape.analyze.changes import Changes
 from mape.config import SwapConfig
@@ -111,7 +110,6 @@ def test_a_state_without_a_format_is_not_handed_over(own):
 
 
 def test_rivers_detectors_are_rebuilt():
-    detectors.register()
     loop = after(5, monitor={"detectors": ["adwin"]})
     assert not replace_part(loop.monitor, "monitor", spec("adwin"), loop.config)
 
