@@ -29,7 +29,7 @@ from mape.errors import BusError
 from mape.parts import owner
 from mape.tables import first_difference
 
-TOLD_BY_ROLES = ("begun", "aborted", "swap refused")
+TOLD_BY_ROLES = ("begun", "aborted", "carried", "swap refused")
 """Kinds of events that a role may tell; the others are Knowledge's own word."""
 
 

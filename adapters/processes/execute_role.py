@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,12 +14,14 @@ from adapters.processes.replacing import Unit, Wanted, reason
 from adapters.processes.role import IDLE, Role, plain
 from knowledge import ChangePlan, Observation, Record
 from mape.config import Config
-from mape.errors import BusError
+from mape.errors import BusError, ManagedSystemError
 from mape.execute import Execute
 from mape.execute.adoption import fitting
-from mape.execute.checkpoint import carried_by, take_up
+from mape.execute.checkpoint import SHARED, carried_by, take_up
 from mape.loop import build_execute
 from mape.states import faults
+
+logger = logging.getLogger(__name__)
 
 HEARD_AT_LEAST = 0.002
 """Seconds between two episodes in which plans are put in force, even if the next one is due."""
@@ -89,6 +92,9 @@ class ExecuteRole(Role):
         unit.component = build_execute(
             self.config, self.systems[unit.loop], unit.knowledge, unit.outbox.append, trial, loop, checkpoint
         )
+        if found is not None and not found[0].final and (names := unit.component.carries()):
+            self._from_the_first(unit, found[0].pass_no, names)
+            found = None
         if found is not None:
             self._swap(unit, state.pass_no)  # the learner that served then
             unit.sent, unit.done = state.pass_no, state.final
@@ -97,6 +103,38 @@ class ExecuteRole(Role):
             in_force = unit.component.plan
             self.member.watch(unit.loop, 0 if in_force is None else in_force.pass_no + 1)
         self._note_aborted(unit)
+
+    def _from_the_first(self, unit: Unit, number: int, names: list[str]) -> None:
+        """Leave a state aside that does not tell all that the system carried, and begin with the first episode.
+
+        Raises
+        ------
+        ManagedSystemError
+            Some of it is held by a class or a module.
+        """
+        from adapters.systems import make_system
+
+        told = (
+            f"{self.config.system.id} carries {', '.join(names)} from one reset to the next, which the state kept at "
+            f"pass {number} does not tell"
+        )
+        ways_out = "get_state() and set_state(), or takes it from the reset's seed and options['episode']"
+        if any(name.startswith(SHARED) for name in names):
+            raise ManagedSystemError(
+                f"{told}. What a class or a module holds, no fresh environment of this process begins without, so that "
+                f"not even all episodes driven again lead there. Have an environment that offers {ways_out}, and begin "
+                "the run anew; or, where no episode can be had again, say redrivable = false."
+            )
+        told += f": all episodes are driven again, from the first. An environment that has {ways_out}, is spared that"
+        logger.warning("execute: %s", told)
+        self.member.note("carried", told, unit.loop, number)
+        self.systems[unit.loop].close()
+        self.systems[unit.loop] = make_system(self.config.system)
+        assert unit.knowledge is not None
+        trial, loop = divmod(unit.loop, self.config.loops)
+        unit.component = build_execute(
+            self.config, self.systems[unit.loop], unit.knowledge, unit.outbox.append, trial, loop
+        )
 
     def _note_aborted(self, unit: Unit) -> None:
         """Note an episode that was broken off and cannot be driven again."""
@@ -135,6 +173,8 @@ class ExecuteRole(Role):
         self._swap(unit, number)
         if not self.systems[unit.loop].redrivable:
             self.member.note("begun", "", unit.loop, number, surely=not self.free)
+        elif number % self.member.joined.snapshot_every == 0:
+            unit.component.look_at(number)  # the state that is kept after it tells what was seen
         unit.component.drive()
 
     def finish(self, unit: Unit) -> None:
@@ -178,6 +218,7 @@ class ExecuteRole(Role):
         self._swap(unit, number)  # what the config plans comes first, whoever drives this episode
         old, config = execute.learner, unit.config
         carried = carried_by(system)
+        execute.look_at(number)  # should it be begun again, with the old learner
         try:
             handed_over = self._replace(unit, wanted.part, wanted.spec)
             self.drive(unit)

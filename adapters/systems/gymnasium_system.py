@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from adapters.systems.held import held
 from adapters.systems.refusals import refusal
 from adapters.systems.state_index import state_index
 from adapters.systems.tabulated import Tabulated
@@ -241,6 +242,13 @@ class GymnasiumSystem:
         elif state is not None:
             raise ValueError(f"{self.name} takes no state (no get_state and set_state); give None")
         self._windows = None
+
+    def held(self, *, stated: bool = False) -> dict[str, str]:
+        """Return a fingerprint of everything that it holds, by name; see `adapters.systems.held`.
+
+        What the environment says itself, by `get_state`, is left out unless it is to be `stated` too.
+        """
+        return held(self.env, base=stated or not self.says_state)
 
     def close(self) -> None:
         """Close the environment."""

@@ -10,6 +10,11 @@ from mape.errors import ManagedSystemError, PartError
 from mape.ports import Json, ManagedSystem
 from mape.states import faults, told
 
+Held = tuple[int, dict[str, str]]
+
+SHARED = "shared "
+"""Begins the name of what all systems of a process hold together: another one, freshly made, does not begin without."""
+
 
 class Checkpoint(NamedTuple):
     """Where Execute is between two episodes.
@@ -21,6 +26,7 @@ class Checkpoint(NamedTuple):
     available : actions that the last episode offered, and those enabled since.
     enabled : actions that plans have enabled so far.
     system : what the managed system carries, or None where it does not say.
+    held : number of an episode, and what the system held after its reset (`held_by`); None where nobody looked.
     """
 
     passes: int
@@ -28,6 +34,7 @@ class Checkpoint(NamedTuple):
     available: tuple[int, ...]
     enabled: tuple[int, ...]
     system: Json
+    held: Held | None = None
 
     def as_json(self) -> Json:
         """Return it as plain JSON."""
@@ -37,6 +44,7 @@ class Checkpoint(NamedTuple):
             "available": list(self.available),
             "enabled": list(self.enabled),
             "system": self.system,
+            "held": None if self.held is None else list(self.held),
         }
 
     @classmethod
@@ -52,7 +60,8 @@ class Checkpoint(NamedTuple):
             plan: Any = None if state["plan"] is None else from_json(json.dumps(state["plan"]))
             if type(state["passes"]) is not int or not (plan is None or type(plan) is ChangePlan):
                 raise ValueError(f"passes {state['passes']!r} under plan {plan}")
-            return cls(state["passes"], plan, tuple(state["available"]), tuple(state["enabled"]), state["system"])
+            held = None if state.get("held") is None else (int(state["held"][0]), dict(state["held"][1]))
+            return cls(state["passes"], plan, tuple(state["available"]), tuple(state["enabled"]), state["system"], held)
         except (KeyError, TypeError, ValueError) as error:
             raise PartError(
                 f"Execute cannot go on from {state!r}: {type(error).__name__}: {error}; give what state() gave for the "
@@ -72,6 +81,28 @@ def carried_by(system: ManagedSystem) -> Json:
         return system.get_state()
     except faults() as error:
         raise ManagedSystemError(f"{system.name} raised {told(error)}, when it was asked for its state") from error
+
+
+def held_by(system: ManagedSystem, *, stated: bool = False) -> dict[str, str]:
+    """Return a fingerprint of everything that a system holds, by name; nothing where there is nothing to look into.
+
+    Of a system that cannot be driven again, or whose episodes are rules, there is not. What `get_state` speaks for is
+    left out, unless it is to be `stated` too.
+    """
+    look = getattr(system, "held", None)
+    if look is None or system.rules is not None or not system.redrivable:
+        return {}
+    found: dict[str, str] = look(stated=stated)
+    return found
+
+
+def differing(one: dict[str, str], other: dict[str, str]) -> list[str]:
+    """Return the names of what two systems do not hold alike.
+
+    >>> differing({"a": "1", "b": "2"}, {"b": "3"})
+    ['a', 'b']
+    """
+    return sorted(name for name in {*one, *other} if one.get(name) != other.get(name))
 
 
 def take_up(system: ManagedSystem, carried: Json, enabled: tuple[int, ...]) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from knowledge import ChangePlan, Knowledge, Observation, QTable
 from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
 from mape.execute import adoption, binding, drive, episode
-from mape.execute.checkpoint import Checkpoint, carried_by, take_up
+from mape.execute.checkpoint import Checkpoint, Held, carried_by, differing, held_by, take_up
 from mape.execute.refusals import check_offer, refused
 from mape.execute.rules import rate_array
 from mape.execute.uniforms import Uniforms
@@ -116,6 +116,8 @@ class Execute:
 
         self._table: QTable | None = None
         self._begun = 0  # the episode whose reset has been done ahead of its drive
+        self._look_at = 0  # the episode after whose reset the system is looked at
+        self._held: Held | None = None
         if checkpoint is not None:
             self.restore(*checkpoint)
         elif (first := system.available(1)) is not None:  # else only the reset of episode 1 can tell
@@ -303,7 +305,7 @@ class Execute:
             The system raised when it was asked for what it carries.
         """
         carried = carried_by(self.system)
-        at = Checkpoint(self.passes, self.plan, self.available, self._enabled, carried)
+        at = Checkpoint(self.passes, self.plan, self.available, self._enabled, carried, self._held)
         return at.as_json(), self.q_table.copy()
 
     def restore(self, state: Json, table: QTable) -> None:
@@ -324,9 +326,37 @@ class Execute:
             )
         rate = self._rate if at.plan is None else adoption.checked_rate(at.plan, self.learner)
         take_up(self.system, at.system, at.enabled)
-        self.passes, self.plan, self._rate, self._enabled = at.passes, at.plan, rate, at.enabled
+        self.passes, self.plan, self._rate, self._enabled, self._held = at.passes, at.plan, rate, at.enabled, at.held
         self._take_actions(at.available, self.passes)
         self._set_table(table.copy())
+
+    def look_at(self, number: int) -> None:
+        """Look at what the system holds after the reset of episode `number`, which the states from then on tell.
+
+        A reset of that episode that comes again, in this process, raises where it does not leave the system as the
+        first one did.
+        """
+        self._look_at = number
+
+    def carries(self) -> list[str]:
+        """Return what a restored Execute's fresh system lacks, by name: what the one before it carried across resets.
+
+        It is reset for the episode after whose reset the other one was looked at, and is then to hold the same. If it
+        does not, no state tells where the other one was, and only all episodes driven again lead there.
+
+        Raises
+        ------
+        ManagedSystemError
+            The system raised at its reset, or does not take its state again.
+        """
+        if self._held is None or not self._held[1] or not held_by(self.system):
+            return []
+        number, before = self._held
+        carried = carried_by(self.system)
+        self._begin(number, self.uniforms.find(number - 1))
+        names = differing(before, held_by(self.system))
+        take_up(self.system, carried, ())  # the reset is none of the run
+        return names
 
     def replace(self, learner: Learner) -> None:
         """Learn by another learner from the next episode on; the Q-table and the plan in force stay.
@@ -392,8 +422,20 @@ class Execute:
             raise
         except faults() as error:
             raise self._failed_to_reset(error, number) from error
+        if number == self._look_at:
+            self._look(number)
         # One object as long as nothing changes: what compares by identity is cheap downstream.
         return self.available if available == self.available else available
+
+    def _look(self, number: int) -> None:
+        before, now = self._held, held_by(self.system)
+        if before is not None and before[0] == number and (names := differing(before[1], now)):
+            raise ManagedSystemError(
+                f"{self.system.name} is begun again in episode {number}, and carries {', '.join(names)} from one reset "
+                "to the next: it is not as it was. Offer get_state() and set_state(), or take it from the reset's "
+                "seed and options['episode']; or, where no episode can be had again, say redrivable = False."
+            )
+        self._held = number, now
 
     def _failed_to_reset(self, error: BaseException, number: int) -> ManagedSystemError:
         return ManagedSystemError(
