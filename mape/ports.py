@@ -149,7 +149,12 @@ class Episode(NamedTuple):
 
 
 class ManagedSystem(Protocol):
-    """What Execute drives. States are indices below `n_states`, actions stable integers below `max_actions`."""
+    """What Execute drives. States are indices below `n_states`, actions stable integers below `max_actions`.
+
+    A system may also have ``held(stated=False)``, which returns name -> fingerprint of what it holds: after two equal
+    resets the same, where it carries nothing beside what `get_state` says (with `stated`, nothing at all). What differs
+    is named by `mapek check`, and keeps a restarted process from going on with a state that does not tell it.
+    """
 
     name: str
     n_states: int

@@ -16,6 +16,7 @@ from knowledge import (
     RowLayout,
 )
 from mape import registry
+from mape.execute.checkpoint import differing, held_by
 from mape.execute.component import SIGNALS, Execute
 from mape.ports import Episode, ManagedSystem
 from mape.specs import PartSpec
@@ -109,23 +110,31 @@ def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) ->
             )
         played = {}
         for number in range(1, episodes + 1):
-            carried = _carried(system)
-            played[number] = (carried, _play(system, number))
+            carried, held = _carried(system), dict[str, str]()
+            played[number] = (carried, _play(system, number, held), held)
         for number in (episodes, 1, middle := (episodes + 1) // 2, middle):
-            carried, moments = played[number]
+            carried, moments, before = played[number]
+            held = {}
             if carried is not None:
                 _carried(other, carried)
             try:
-                _compare(moments, _play(other, number), f"episode {number}, driven again after others")
+                again = _play(other, number, held)
+                if names := differing(before, held):
+                    raise Broken(
+                        f"after equal resets for episode {number}, it does not hold the same {', '.join(names)}, but "
+                        "what earlier episodes left there"
+                    )
+                _compare(moments, again, f"episode {number}, driven again after others")
             except Broken as broken:
                 if carried is not None:
                     raise Broken(
                         f"{broken}, although its state was set; get_state() holds all that it carries"
                     ) from None
                 raise Noted(
-                    f"not resumable: {broken}. Take all randomness from the episode's seed or uniforms, and the "
-                    "episode's number from the reset; or offer get_state() and set_state(); or, where no episode can "
-                    "be had again, say redrivable = False"
+                    f"not resumable from a state: {broken}. Take all randomness from the episode's seed or uniforms, "
+                    "and the episode's number from the reset; or offer get_state() and set_state(); or, where no "
+                    "episode can be had again, say redrivable = False. Until then a run that is taken up again drives "
+                    "all its episodes anew, or is refused"
                 ) from None
 
     def by_rules() -> None:
@@ -184,8 +193,11 @@ def play_at_random(system: ManagedSystem, number: int) -> None:
     _play(system, number)
 
 
-def _play(system: ManagedSystem, number: int) -> list[_Moment]:
+def _play(system: ManagedSystem, number: int, held: dict[str, str] | None = None) -> list[_Moment]:
+    """Drive an episode by random actions; `held` takes what the system holds after the reset."""
     state, available = system.begin(_episode(system, number))
+    if held is not None:
+        held.update(held_by(system, stated=True))
     if not available or len({*available}) != len(available) or any(type(a) is not int or a < 0 for a in available):
         raise Broken(f"episode {number} offers {available!r}; give at least one action, distinct ints from 0")
     _in_range(system, state, f"begin() of episode {number}")

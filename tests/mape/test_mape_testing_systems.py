@@ -4,13 +4,15 @@ import random
 from types import SimpleNamespace
 
 import faulty_rules
+import gymnasium
 import numpy as np
 import pytest
 from faulty_parts import MEMBERS, faults, variant, without
 from mape_runs import Carrying, Corridor
+from worn_worlds import CARRIES, Said
 
 from adapters.systems import make_system
-from mape.config import SystemConfig
+from mape.config import BoxGrid, SystemConfig
 from mape.testing import check_system
 
 
@@ -157,7 +159,7 @@ def verdicts(findings):
 def test_a_system_whose_episodes_depend_on_those_before_is_noted_as_not_resumable():
     (finding,) = (f for f in check_system(Carrying) if f.check == WHATEVER)
     assert finding.verdict == "note"
-    assert finding.detail.startswith("not resumable: episode")
+    assert finding.detail.startswith("not resumable from a state: episode")
 
 
 def test_a_system_that_cannot_be_driven_again_says_so_and_is_noted():
@@ -189,3 +191,43 @@ def test_every_system_that_a_check_makes_is_closed():
 
     check_system(Closing)
     assert closed == made != []
+
+
+def held(findings):
+    (finding,) = (finding for finding in findings if finding.check == WHATEVER)
+    return finding
+
+
+@pytest.mark.parametrize(("name", "carried"), [*CARRIES.items(), ("Class", "shared Class.turns")])
+def test_what_an_environment_carries_is_named_though_its_episodes_show_nothing_of_it(name, carried):
+    finding = held(check_system(lambda: make_system(SystemConfig(id=f"{name}-v0"))))
+    assert finding.verdict == "note"
+    assert carried in finding.detail
+
+
+@pytest.mark.parametrize(
+    "name", ["Fresh", "Said", "Watched", "FrozenLake-v1", "Taxi-v4", "CartPole-v1", "Blackjack-v1"]
+)
+def test_an_environment_that_carries_nothing_or_says_it_is_found_to_do_so(name):
+    grid = BoxGrid(low=(-1.0,) * 4, high=(1.0,) * 4, bins=(2,) * 4) if name == "CartPole-v1" else None
+    config = SystemConfig(
+        id=name if "-v" in name else f"{name}-v0",
+        max_steps=50,
+        discretise=grid,
+    )
+    assert held(check_system(lambda: make_system(config), 3)) == (WHATEVER, "ok", "")
+
+
+def test_a_state_that_leaves_something_out_is_told_what():
+    class Forgets(Said):
+        def get_state(self):
+            return 0
+
+    gymnasium.register("Forgets-v0", Forgets, max_episode_steps=3)
+    try:
+        finding = held(check_system(lambda: make_system(SystemConfig(id="Forgets-v0"))))
+    finally:
+        del gymnasium.registry["Forgets-v0"]
+    assert finding.verdict == "failed"
+    assert "does not hold the same total" in finding.detail
+    assert "although its state was set; get_state() holds all" in finding.detail

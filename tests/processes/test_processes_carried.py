@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+import worn_worlds
 from bus_small_loop import in_process
 from real_processes import events, hashes, run, run_here, up, write_config
 from roles_on_threads import Paced, Roles, paced
@@ -63,7 +64,7 @@ def stopped(here, walk):
     """Begin a run and stop it by SIGTERM some passes after a state that is kept."""
 
     def begin(name):
-        (here / "worn_worlds.py").write_bytes(Path(__file__).with_name("worn_worlds.py").read_bytes())
+        (here / "worn_worlds.py").write_bytes(Path(worn_worlds.__file__).read_bytes())
         table = {
             "name": "worn",
             "episodes": WEARS_AT + 20,
@@ -88,9 +89,7 @@ def test_a_resumed_run_comes_to_the_hashes_of_one_that_was_never_stopped(here, s
     assert "carries total" in run("log", "up", "--events", cwd=here).stdout
 
 
-@pytest.mark.parametrize(
-    ("name", "carried"), [("Class", "shared Class.turns"), ("Module", "shared worn_worlds.MODULE")]
-)
+@pytest.mark.parametrize(("name", "carried"), [("Class", "Class.turns"), ("Module", "worn_worlds.MODULE")])
 def test_what_a_whole_process_shares_is_refused_by_its_name(name, carried, here, stopped):
     stopped(name)
     said = run("resume", "up", cwd=here, code=1)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections import UserList
 
 import gymnasium
 import pytest
@@ -19,8 +20,8 @@ class Plant(gymnasium.Env):
 
     observation_space, action_space = spaces.Discrete(5), spaces.Discrete(2)
     redrivable = False
-    done: list[str | int] = []  # noqa: RUF012
-    open: list["Plant"] = []  # noqa: RUF012
+    done: UserList[str | int] = UserList()  # noqa: RUF012 - no data of the class, which would be looked at as carried
+    open: UserList["Plant"] = UserList()  # noqa: RUF012
     fails_at = 0
     turned = 0
 
@@ -59,8 +60,8 @@ gymnasium.register("Redrivable-v0", Redrivable, max_episode_steps=3)
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    monkeypatch.setattr(Plant, "done", [])
-    monkeypatch.setattr(Plant, "open", [])
+    monkeypatch.setattr(Plant, "done", UserList())
+    monkeypatch.setattr(Plant, "open", UserList())
     monkeypatch.setattr(Plant, "turned", 0)
 
 
@@ -145,8 +146,9 @@ def test_a_system_that_can_be_driven_again_is_so_from_the_last_state_on_and_not_
         run.join()
     after = Plant.done[before:]
     again = [number for number in after[after.index("closed") + 1 :] if number != "closed"]
+    # The first reset is that of the state's own episode: what it leaves is held against what the state tells.
     assert again == list(range(again[0], 41))
-    assert again[0] % 10 == 1
+    assert again[0] % 10 == 0
     assert again[0] > 1
 
 

@@ -41,10 +41,10 @@ class Fresh(gymnasium.Env):
 
 
 class Attribute(Fresh):
-    total = None
+    total = 0
 
     def count_it(self):
-        self.total = (self.total or 0) + 1
+        self.total += 1
 
     def resets(self, episode):
         return self.total
