@@ -109,6 +109,10 @@ class MonitorConfig(PartConfig):
     detectors: tuple[DetectorSpec, ...] = ()
 
 
+ENGINES = ("auto", "compiled", "python")
+MODES = ("lockstep", "free")
+
+
 class ExecuteConfig(PartConfig):
     """How episodes are driven."""
 
@@ -121,15 +125,15 @@ class ExecuteConfig(PartConfig):
     @field_validator("engine")
     @classmethod
     def _known(cls, engine: str) -> str:
-        if engine not in ("auto", "compiled", "python"):
-            raise ValueError(f"engine {engine!r} is not one of auto, compiled, python")
+        if engine not in ENGINES:
+            raise ValueError(str(UnknownName("engine", engine, ENGINES)))
         return engine
 
     @field_validator("mode")
     @classmethod
     def _either(cls, mode: str) -> str:
-        if mode not in ("lockstep", "free"):
-            raise ValueError(f"mode {mode!r} is not one of lockstep, free")
+        if mode not in MODES:
+            raise ValueError(str(UnknownName("mode", mode, MODES)))
         return mode
 
     @model_validator(mode="after")

@@ -32,6 +32,23 @@ PART_OWNER = {
 """The component that holds a part; ``monitor.K`` is Monitor's too."""
 
 
+_KINDS = {"analyze": "analyzer", "plan": "planner", "plan.schedule": "schedule", "learner": "learner"}
+
+
+def kind_of(part: str) -> str:
+    """Return the kind that a part is of, whatever run it is in.
+
+    Raises
+    ------
+    UnknownName
+        There is no such part.
+
+    >>> kind_of("monitor.1"), kind_of("plan")
+    ('detector', 'planner')
+    """
+    return "detector" if owner(part) == "monitor" else _KINDS[part]
+
+
 def owner(part: str) -> str:
     """Return the component that holds a part.
 

@@ -117,6 +117,19 @@ def import_for(named: str, module_name: str) -> ModuleType:
         raise ConfigError(f"{named}: its module raised {told(error)}") from error
 
 
+def entry(kind: str, name: str) -> Entry:
+    """Return what stands behind a short name.
+
+    Raises
+    ------
+    UnknownName
+        Nothing does.
+    """
+    if name not in PARTS[kind]:
+        raise UnknownName(kind, name, PARTS[kind], 'A part of your own is named "module:Class".')
+    return PARTS[kind][name]
+
+
 def find(kind: str, name: str) -> Any:
     """Return the class behind a short name or ``"module:Class"``.
 
@@ -125,13 +138,7 @@ def find(kind: str, name: str) -> Any:
     ConfigError
         No such short name, module or class, or the module cannot be imported.
     """
-    entries = PARTS[kind]
-    if name in entries:
-        target = entries[name].target
-    elif ":" in name:
-        target = name
-    else:
-        raise UnknownName(kind, name, entries, 'A part of your own is named "module:Class".')
+    target = name if ":" in name and name not in PARTS[kind] else entry(kind, name).target
     module_name, _, attribute = target.partition(":")
     if not module_name or not attribute:
         raise ConfigError(f'{kind} {name!r} is not of the form "module:Class", such as "my_parts:MyDetector"')

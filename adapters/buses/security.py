@@ -23,6 +23,7 @@ import zenoh
 from adapters.roles import KNOWLEDGE, OPERATOR
 from adapters.roles import ROLES as STAGES
 from mape.errors import ConfigError, UnknownName
+from mape.near import did_you_mean, nearest_path
 
 CLIENTS = (*STAGES, OPERATOR)
 """The roles that connect to Knowledge."""
@@ -194,9 +195,10 @@ def _check_readable(path: Path) -> None:
     try:
         path.open("rb").close()
     except FileNotFoundError:
+        near = did_you_mean(nearest_path(path, os.path.isfile))
         raise ConfigError(
-            f"there is no {path}. Make all keys with `mapek keys DIR`, in a new folder, and give each host ca.pem and "
-            "the .pem and .key of its roles."
+            f"there is no {path}{near} Make all keys with `mapek keys DIR`, in a new folder, and give each host "
+            "ca.pem and the .pem and .key of its roles."
         ) from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import itertools
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any, NoReturn
 
 # Nothing else is imported here: `mapek --help` must answer at once.
 
@@ -22,15 +27,55 @@ exit codes: 0 done, 1 failure, 2 usage, 130 stopped by Ctrl-C (finished trials a
 
 _CONFIG = "TOML file, an example by its name (`mapek examples`), or the config-*.json of an earlier run"
 
+_OPTION = re.compile("--[a-zA-Z][a-zA-Z0-9-]*")
+
 
 class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> None:  # type: ignore[override]
+    """A command, which says of a word that it does not know which one may have been meant."""
+
+    _way_out = ""
+
+    def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}\nSee `{self.prog} --help`.\n")
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        args = sys.argv[1:] if args is None else list(args)
+        # Here, for else argparse first finds what a misspelt option has left missing.
+        for word in itertools.takewhile(self._is_mine, args):
+            option = word.partition("=")[0]
+            if _OPTION.fullmatch(option) and not any(known.startswith(option) for known in self._option_string_actions):
+                told = (name for name, a in self._option_string_actions.items() if a.help is not argparse.SUPPRESS)
+                self._unknown("option", option, (name for name in told if name.startswith("--")))
+        return super().parse_known_args(args, namespace)
+
+    def _is_mine(self, word: str) -> bool:
+        return word != "--"
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            what = action.option_strings[-1] if action.option_strings else action.dest
+            self._unknown(what, str(value), map(str, action.choices))
+
+    def _unknown(self, what: str, word: str, legal: Iterable[str]) -> NoReturn:
+        from mape.errors import UnknownName
+
+        self.error(str(UnknownName(what, word, legal, self._way_out)))
+
+
+class _Top(_Parser):
+    """The command line whole: what comes after a command is that command's."""
+
+    _way_out = "Options of a command come after it."
+
+    def _is_mine(self, word: str) -> bool:
+        return word.startswith("-") and word != "--"
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    top = _Parser(
+    top = _Top(
         prog="mapek", description=DESCRIPTION, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     top.add_argument("--version", action="store_true", help="print versions and leave")

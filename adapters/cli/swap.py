@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import json
 import time
 import tomllib
 import uuid
 from typing import Any
 
 import zenoh
+from pydantic import ValidationError
 
+from adapters import detectors
 from adapters.buses.messages import Control, Replaced
 from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import Wire
 from adapters.cli.common import operator
 from adapters.processes.replacing import CHECKED_WITHIN
 from adapters.processes.supervise import ask_status
+from mape import registry
+from mape.config import DetectorSpec, PlannerSpec
 from mape.errors import BusError, ConfigError, MapekError
-from mape.parts import owner
+from mape.parts import kind_of, owner
+from mape.specs import PartSpec, explain
 from mape.tables import refuse_infinity
 
 ANSWERED_WITHIN = CHECKED_WITHIN + 15.0
@@ -32,13 +38,34 @@ LOOK_EVERY = 0.05
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
-    control = Control(what="swap", part=chosen.part, to=_spec(chosen.to), question=uuid.uuid4().hex)
+    role, to = owner(chosen.part), _spec(chosen.to)
+    _look_at(chosen.part, to)
+    control = Control(what="swap", part=chosen.part, to=to, question=uuid.uuid4().hex)
     with operator(chosen) as (session, wire):
-        reply = _ask(owner(chosen.part), control, session, wire)
+        reply = _ask(role, control, session, wire)
     if reply.ok is None:
         raise MapekError(_refusal(reply))
     _print(Replaced.unpack(reply.ok.payload.to_bytes())[0], chosen.to)
     return 0
+
+
+def _look_at(part: str, to: dict[str, Any]) -> None:
+    """Refuse here what no role could take: an unknown short name, or an illegal option of what is built in."""
+    detectors.register()
+    kind = kind_of(part)
+    models: dict[str, type[PartSpec]] = {"detector": DetectorSpec, "planner": PlannerSpec}
+    model = models.get(kind, PartSpec)
+    try:
+        spec = model.model_validate_json(json.dumps(to))
+    except ValidationError as error:
+        raise ConfigError(explain(error, f"{part}.", model)) from None
+    named = [(kind, part, spec)]
+    if isinstance(spec, PlannerSpec):
+        named.append(("schedule", f"{part}.schedule", spec.schedule))
+    for each, where, one in named:
+        # What is not built in has to be found where the role runs, and not here.
+        if ":" not in one.name and registry.entry(each, one.name).target.startswith("mape."):
+            registry.options_of(each, one, where)
 
 
 def _ask(role: str, control: Control, session: zenoh.Session, wire: Wire) -> zenoh.Reply:

@@ -156,6 +156,8 @@ def _collect(config: Config, label: str, folder: RunFolder) -> tuple[list[TrialR
 
 def _waiting(supervisor: Supervisor) -> str:
     why = supervisor.why_waiting()
+    if supervisor.status is None and not why:
+        return "starting"
     return f"waiting ({why.rstrip('.')})" if why else "waiting"
 
 

@@ -51,7 +51,7 @@ KEEPS_FAILING = 60.0
 FRESH = 3.0
 """Seconds for which Knowledge's word on who is hung is believed."""
 
-TOLD_AFTER = 5.0
+TOLD_AFTER = 15.0
 """Seconds after its start after which it is told that Knowledge cannot be reached."""
 
 STOPPED_AFTER = LEASE_MS / 1000
@@ -178,6 +178,7 @@ class Supervisor:
         self.status: Status | None = None
         self._status_of = 0.0  # when it was asked for
         self._unreached = ""
+        self._others = False  # whether another Knowledge answers in the place of ours
         self._told_unreached = False
         self._heard_at = 0.0
         self._asked_at = 0.0
@@ -310,9 +311,9 @@ class Supervisor:
             child.kill()
 
     def why_waiting(self) -> str:
-        """Say for what the run waits, as far as that is known."""
+        """Say for what the run waits, as far as that is known; of a Knowledge that is just starting, nothing."""
         if not self._heard_at:
-            return self._unreached
+            return self._unreached if self._others or self._told_unreached else ""
         for role, child in self.children.items():
             joined = None if self.status is None else self.status.roles.get(role)
             if joined is not None and not joined.alive and not child.done and child.said():
@@ -329,6 +330,7 @@ class Supervisor:
             if self._operator is None:
                 self._operator = self.wire.join(OPERATOR, 0.2)
             found = ask_status(self._operator, self.wire, 0.5)
+            self._others = bool(found)
             self._unreached = f"another Knowledge answers on {self.wire.endpoint}" if found else ""
         except BusError as error:
             self._unreached = str(error)

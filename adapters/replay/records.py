@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -17,6 +18,7 @@ from adapters.systems.declared import is_plant
 from knowledge import STAGES, Ack, ChangePlan, FreeLog, Observation, Record, RowLayout, from_json, to_json
 from mape.config import Config, from_table
 from mape.errors import ConfigError, PartError, ResultsError
+from mape.near import did_you_mean, nearest_path
 from mape.parts import config_at
 
 BATCH = 512
@@ -34,7 +36,10 @@ def log_of(path: Path) -> Path | None:
     if path.is_dir():
         return path / LOG_NAME if (path / LOG_NAME).is_file() else None
     if not path.exists():
-        raise ResultsError(f"there is no folder or file {path}; name the folder of a run, or its {LOG_NAME}")
+        near = nearest_path(path, os.path.exists)
+        raise ResultsError(
+            f"there is no folder or file {path}{did_you_mean(near)} Name the folder of a run, or its {LOG_NAME}"
+        )
     return path
 
 

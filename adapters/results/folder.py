@@ -39,6 +39,7 @@ from adapters.results.table import read_episodes, read_last, write_npz
 from adapters.versions import versions
 from mape.config import Config
 from mape.errors import MapekError, ResultsError
+from mape.near import did_you_mean, nearest_path
 from mape.tables import first_difference
 from mape.trials import TrialResult
 
@@ -91,7 +92,11 @@ def read_manifest(path: Path, way_out: str = "name the folder that `mapek` wrote
     """
     manifest = path / "manifest.json"
     if not os.path.isfile(manifest):  # which says no of a name that is too long; a Path raises
-        raise ResultsError(f"{path} holds no run of ours; name the folder that `mapek` wrote (results/NAME-DATE-TIME)")
+        near = None if os.path.exists(path) else nearest_path(path)
+        raise ResultsError(
+            f"{path} holds no run of ours{did_you_mean(near)} Name the folder that `mapek` wrote "
+            "(results/NAME-DATE-TIME)"
+        )
     try:
         there = read_json(manifest)
     except ResultsError as error:
