@@ -12,7 +12,6 @@ from typing import Any
 import zenoh
 from pydantic import ValidationError
 
-from adapters import detectors
 from adapters.buses.messages import Control, Replaced
 from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import Wire
@@ -51,7 +50,6 @@ def execute(chosen: argparse.Namespace) -> int:
 
 def _look_at(part: str, to: dict[str, Any]) -> None:
     """Refuse here what no role could take: an unknown short name, or an illegal option of what is built in."""
-    detectors.register()
     kind = kind_of(part)
     models: dict[str, type[PartSpec]] = {"detector": DetectorSpec, "planner": PlannerSpec}
     model = models.get(kind, PartSpec)
