@@ -18,13 +18,13 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from adapters.buses.inbox import Inbox
-from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout
+from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout, State
 from adapters.buses.outbox import Outbox
 from adapters.buses.questions import Questions, Refused
 from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Unanswered, Wire, hand_over, host, role_of
 from adapters.roles import KNOWLEDGE, STAGE_OF
-from knowledge import MalformedRecord, Record, to_json
+from knowledge import MalformedRecord, QTable, Record, to_json
 from mape.errors import BusError
 
 logger = logging.getLogger(__name__)
@@ -89,6 +89,8 @@ class Member(Questions):
         self.joined = Joined(epoch=0, seal="", units=0, layout=None, last=(), swaps=())
         self.refused = 0
         self.passes = 0  # for the heartbeat: what all loops together have done
+        self.vouched: Callable[[], bool] = lambda: True  # whether who does the work is alive, if on another thread
+        self._woken = False
         self._config, self._versions, self._layout = dict(config or {}), dict(versions or {}), layout
         self._arrived: SimpleQueue[Any] = SimpleQueue()  # filled by Zenoh's threads, and by nobody else
         self._waiting: deque[Record | Asked] = deque()
@@ -212,15 +214,15 @@ class Member(Questions):
 
     # Sending.
 
-    def send(self, record: Record, state: bytes = b"") -> None:
+    def send(self, record: Record, state: State | None = None, table: QTable | None = None) -> None:
         """Have `record` appended; it is sent again until Knowledge has acknowledged it.
 
         Parameters
         ----------
         record
             The next one of its loop.
-        state
-            A packed `State` that is written together with the record.
+        state, table
+            Written together with the record, or neither is.
 
         Raises
         ------
@@ -233,7 +235,8 @@ class Member(Questions):
             raise BusError(
                 f"{type(record).__name__} {record.pass_no} cannot be written for the wire: {error}"
             ) from error
-        self._outbox.put(record.loop, record.pass_no, payload, self._epoch + b"\n" + state if state else self._epoch)
+        behind = self._epoch if state is None else self._epoch + b"\n" + state.pack(table)
+        self._outbox.put(record.loop, record.pass_no, payload, behind)
 
     def drop(self, loop: int, first: int, last: int) -> None:
         """Say that episodes of a free-running loop will not be logged."""
@@ -297,7 +300,7 @@ class Member(Questions):
         looked = False
         while True:
             now = time.monotonic()
-            if now >= self._beat_at:
+            if now >= self._beat_at and self.vouched():
                 self.beat(waiting=not self._waiting)
             if now >= self._kept_up_at:
                 self._keep_up(now)
@@ -310,6 +313,14 @@ class Member(Questions):
                 return None
             self._take_in(min(left, KEEP_UP_EVERY))
             looked = True
+            if self._woken:
+                self._woken, deadline = False, now
+
+    def wake(self) -> None:
+        """Have `receive`, in which another thread waits, return."""
+        if not self._woken:
+            self._woken = True
+            self._arrived.put(("woken", None))
 
     def _take_in(self, timeout: float) -> None:
         """Take what Zenoh's threads have put down, waiting for the first of it."""
@@ -322,6 +333,8 @@ class Member(Questions):
                     self._acknowledged(what)
                 elif kind == "since":
                     self._caught_up(what)
+                elif kind == "woken":
+                    pass
                 elif kind == "knowledge":
                     if what.kind == zenoh.SampleKind.PUT:
                         self._link_again()

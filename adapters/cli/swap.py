@@ -28,7 +28,7 @@ from mape.tables import refuse_infinity
 ANSWERED_WITHIN = CHECKED_WITHIN + 15.0
 """Seconds that a role has to check the part and to reach the end of its pass."""
 
-THERE_WITHIN = 5.0
+THERE_WITHIN = 15.0
 """Seconds that a role has to be there: it may just be started again, or its link be about to come back."""
 
 LOOK_EVERY = 0.05

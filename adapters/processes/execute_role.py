@@ -6,10 +6,11 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, cast
 
 from adapters.buses.member import Asked, Member
 from adapters.buses.messages import State, Table
+from adapters.processes.detached import Brought, Detached
 from adapters.processes.replacing import Unit, Wanted, reason
 from adapters.processes.role import IDLE, Role, plain
 from knowledge import ChangePlan, Observation, Record
@@ -183,7 +184,8 @@ class ExecuteRole(Role):
             self._refuse(unit.wanted, "the run is over")
         state, table = unit.component.state()
         self.member.unwatch(unit.loop)
-        self.member.settle()
+        if not self.free:  # who runs freely says one after the other, and waits at the end
+            self.member.settle()
         final = State(loop=unit.loop, pass_no=unit.component.passes, state=plain(state), final=True)
         self.member.keep_surely(final, table)
         unit.done = True
@@ -194,8 +196,7 @@ class ExecuteRole(Role):
             self.member.send(record)
             return
         state, table = unit.component.state()
-        packed = State(loop=unit.loop, pass_no=record.pass_no, state=plain(state)).pack(table)
-        self.member.send(record, packed)
+        self.member.send(record, State(loop=unit.loop, pass_no=record.pass_no, state=plain(state)), table)
 
     def keep(self, unit: Unit) -> None:
         """Have a loop's state and Q-table kept at Knowledge."""
@@ -251,7 +252,8 @@ class FreeExecuteRole(ExecuteRole):
 
     Each episode is driven under the newest plan that has come; all that came are put in force, in order. What cannot be
     sent fast enough is held back, at most `execute.backlog` Observations of each loop; what is beyond that is dropped,
-    and said in one record when Knowledge takes records again.
+    and said in one record when Knowledge takes records again. While they are driven, the link is another thread's: they
+    do not stand still for a network either.
     """
 
     def run(self) -> None:
@@ -268,28 +270,38 @@ class FreeExecuteRole(ExecuteRole):
             self.begin()
             for unit in self.units:
                 self._catch_up(unit)
-            due = time.monotonic()
-            while not self.stopping.is_set() and not all(unit.done for unit in self.units):
-                self._hear(due, 0.5 / rate)
-                if self._vetted:
-                    self._let_in()
-                if time.monotonic() < due:
-                    continue
-                # Behind by more than a second, it is not caught up: the rate is the system's own.
-                due = max(due + 1.0 / rate, time.monotonic() - 1.0)
-                for unit in self.units:
-                    self._tick(unit)
-            self._refuse_all()
-            if not self.stopping.is_set():
-                self.member.settle()
+            with Detached(self.member) as link:
+                self.member = cast(Member, link)  # all of it that is used from here on
+                self._drive_all(rate)
+
+    def _drive_all(self, rate: float) -> None:
+        due = time.monotonic()
+        while not self.stopping.is_set() and not all(unit.done for unit in self.units):
+            self._hear(due, 0.5 / rate)
+            if self._vetted:
+                self._let_in()
+            if time.monotonic() < due:
+                continue
+            # Behind by more than a second, it is not caught up: the rate is the system's own.
+            due = max(due + 1.0 / rate, time.monotonic() - 1.0)
+            for unit in self.units:
+                self._tick(unit)
+        self._refuse_all()
+        if not self.stopping.is_set():
+            self.member.settle()
 
     def _hear(self, due: float, most: float) -> None:
         """Put in force what comes until the next episode is due; of what has come, for a while even if it is."""
-        came = self.member.receive(max(0.0, min(due - time.monotonic(), IDLE)))
+        came: Record | Asked | Brought | None = self.member.receive(max(0.0, min(due - time.monotonic(), IDLE)))
         until = max(due, time.monotonic() + max(most, HEARD_AT_LEAST))
         while came is not None:
             if isinstance(came, Asked):
                 self._asked(came)
+            elif isinstance(came, Brought):
+                unit = self.units[came.plan.loop]
+                assert unit.knowledge is not None
+                unit.knowledge.bring(came.table)
+                self._adopt(unit, came.plan)
             else:
                 self._adopt(self.units[came.loop], came)
             came = self.member.receive(0.0) if time.monotonic() < until else None

@@ -134,6 +134,7 @@ class RemoteKnowledge(Knowledge):
         super().__init__(cast(Log, RemoteLog(member, layout, loop)))
         self._member = member
         self._actions: tuple[int, ...] | None = None
+        self._brought: QTable | None = None
         self._number = 0  # the pass that is being worked on, and what was remembered before
         self._remembered_before: OrderedDict[str, QTable] = OrderedDict()
 
@@ -179,7 +180,14 @@ class RemoteKnowledge(Knowledge):
         """
         if self._member.role == "plan":
             return super().recall(key)
+        brought, self._brought = self._brought, None
+        if brought is not None and brought.sha256() == key:
+            return brought
         return self._fetched(key)  # named by a plan, when Plan could recall it
+
+    def bring(self, table: QTable) -> None:
+        """Have a table here that is about to be recalled, so that it need not be asked for then."""
+        self._brought = table
 
     def adopted(self, plan: ChangePlan) -> None:
         """Take note that a plan adopts a remembered table: Execute recalls it then, which is a use of it as any other.

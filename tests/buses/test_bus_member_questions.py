@@ -44,7 +44,7 @@ def test_a_state_that_is_not_waited_for_is_kept_too(site, all_four):
 def test_a_state_travels_with_its_record(site, all_four):
     site.send(plan(0))
     state = State(loop=0, pass_no=1, state={"rng": 5})
-    all_four["execute"].send(observation(1), state.pack(a_table()))
+    all_four["execute"].send(observation(1), state, a_table())
     all_four["execute"].settle(60)
     again, table = all_four["execute"].snapshot(0)
     assert (again, table.sha256()) == (state, a_table().sha256())
