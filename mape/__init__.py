@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mape.bus import LocalBus
-    from mape.config import Config, load
+    from mape.config import Config, from_table, load
     from mape.errors import (
         BusError,
         ConfigError,
@@ -26,7 +26,7 @@ __version__ = "0.2.0.dev0"
 
 _HOMES = {
     "mape.bus": ("LocalBus",),
-    "mape.config": ("Config", "load"),
+    "mape.config": ("Config", "from_table", "load"),
     "mape.errors": (
         "BusError",
         "ConfigError",
@@ -56,6 +56,7 @@ __all__ = [
     "ResultsError",
     "TrialResult",
     "UnknownName",
+    "from_table",
     "load",
     "run_trial",
 ]

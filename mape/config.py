@@ -289,16 +289,39 @@ def load(
     Raises
     ------
     ConfigError
-        The file cannot be read, or what it says is not legal.
+        The file cannot be read, or what it says is not legal, or an override, which is then named.
     """
     chosen = [f"{kind} {name}" for kind, name in (("profile", profile), ("agent", agent)) if name is not None]
+    where, given = ", ".join([str(path), *chosen]), list(overrides)
     try:
-        return from_table(_laid_over(path, profile, agent, overrides), ", ".join([str(path), *chosen]))
+        table = _laid_over(path, profile, agent)
+        whole = table
+        for override in given:
+            whole = merge(whole, parse_override(override))
+        try:
+            return from_table(whole, where)
+        except ConfigError:
+            _blame(table, given, where)
+            raise
     except RecursionError:
         raise ConfigError(f"{path}, with what is laid over it, holds {TOO_DEEP}") from None
 
 
-def _laid_over(path: str | Path, profile: str | None, agent: str | None, overrides: Iterable[str]) -> Table:
+def _blame(table: Table, overrides: list[str], where: str) -> None:
+    """Raise what is wrong with a config under the name of the override that makes it so; return where none does."""
+    said = where
+    for override in ["", *overrides]:
+        if override:
+            table, said = merge(table, parse_override(override)), f"--set {override}, over {where}"
+        try:
+            from_table(table, said)
+        except ConfigError:
+            if not override:
+                return
+            raise
+
+
+def _laid_over(path: str | Path, profile: str | None, agent: str | None) -> Table:
     table = read_table(path)
     for kind, chosen in (("profile", profile), ("agent", agent)):
         overlays = _overlays(path, table, kind)
@@ -309,8 +332,6 @@ def _laid_over(path: str | Path, profile: str | None, agent: str | None, overrid
             if not isinstance(overlays[chosen], dict):
                 raise ConfigError(f"{path}: {kind}s.{chosen} is a table, [{kind}s.{chosen}]")
             table = merge(table, overlays[chosen])
-    for override in overrides:
-        table = merge(table, parse_override(override))
     return table
 
 

@@ -2,20 +2,47 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from mape.errors import ConfigError
 from mape.near import did_you_mean, nearest
 
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)  # whose home is pydantic's own affair
 
-class PartConfig(BaseModel):
-    """Base of all options: frozen, strict, no unknown field, no NaN or infinity."""
+
+class _InSentences(ModelMetaclass):
+    """Says what is wrong where a model is made by hand: pydantic's own words name no way out.
+
+    Made of tables it is told by who reads them; pydantic does not come by here then.
+    """
+
+    def __call__(self, *args: Any, **fields: Any) -> Any:
+        try:
+            return super().__call__(*args, **fields)
+        except ValidationError as error:
+            tables = " Lists and tables as they stand in TOML are taken by mape.from_table({...})."
+            made_of = tables if any(isinstance(value, (list, dict)) for value in fields.values()) else ""
+            raise ConfigError(explain(error, f"{self.__name__}: ", cast(type[BaseModel], self)) + made_of) from None
+
+
+class PartConfig(BaseModel, metaclass=_InSentences):
+    """Base of all options: frozen, strict, no unknown field, no NaN or infinity.
+
+    Raises
+    ------
+    ConfigError
+        Names each field that is wrong, its value, and what is legal.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class PartSpec(BaseModel):
+class PartSpec(BaseModel, metaclass=_InSentences):
     """A part by short name or ``"module:Class"``, and its options; a string alone means no options."""
 
     model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 from mape_runs import GRID
 
-from mape.config import Config, SwapConfig, from_table, load, overlays_of, parts_of
+from mape.config import Config, DetectorSpec, SwapConfig, SystemConfig, from_table, load, overlays_of, parts_of
 from mape.errors import ConfigError, UnknownName
+from mape.monitor.page_hinkley import PageHinkleyConfig
 from mape.tables import NOTHING, first_difference, merge, parse_override
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -492,3 +493,52 @@ def test_units_count_the_loops_of_all_trials():
     for loop in (-1, 4):
         with pytest.raises(ConfigError, match=f"loop {loop} is not one of the 4 loops of a trial"):
             chosen.unit(0, loop)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Config(monitor={"detectors": ["page_hinkley"]}), r"Config: monitor\.detectors: .*from_table"),
+        (lambda: Config(episodes=0, system={"id": "x"}), "Config: episodes: .*greater than or equal to 1, got 0"),
+        (lambda: Config(episodes=1, system={"id": "x"}, epsodes=2), "epsodes: no such option; did you mean 'episodes'"),
+        (lambda: SystemConfig(id=3), "SystemConfig: id: .*string, got 3"),
+        (lambda: PageHinkleyConfig(threshold=-1.0), "PageHinkleyConfig: threshold: .*greater than 0"),
+        (lambda: DetectorSpec(name=""), "DetectorSpec: name: "),
+        (lambda: SystemConfig("x"), "takes 1 positional argument"),
+    ],
+)
+def test_a_config_that_is_made_by_hand_is_refused_in_a_sentence(make, says):
+    with pytest.raises((ConfigError, TypeError), match=says):
+        make()
+
+
+def test_what_is_needed_to_make_a_config_of_a_table_is_exported():
+    import mape
+
+    table = {"episodes": 3, "system": {"id": "x"}, "monitor": {"detectors": ["page_hinkley"]}}
+    assert mape.from_table(table).monitor.detectors[0].name == "page_hinkley"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "blamed"),
+    [
+        (["system.max_steps=0"], "--set system.max_steps=0, over "),
+        (["seed=4", "plan.alhpa=0.3", "episodes=5"], "--set plan.alhpa=0.3, over "),
+        (["episodes=5", "episodes=none"], "--set episodes=none, over "),
+        (["episodes=9", "swap=[{pass = 7, part = 'plan', to = 'q_learning'}]", "episodes=6"], "--set episodes=6, over "),
+    ],
+)
+def test_an_override_that_is_not_legal_is_named_and_not_the_file(file, overrides, blamed):
+    with pytest.raises(ConfigError, match=re.escape(blamed)):
+        load(file(RUN), overrides=overrides)
+
+
+def test_a_file_that_is_not_legal_is_named_and_not_the_override(file):
+    path = file(RUN.replace("alpha = 0.2", "alhpa = 0.2"))
+    with pytest.raises(ConfigError, match=f"^{re.escape(str(path))}: plan"):
+        load(path, overrides=["episodes=3"])
+
+
+def test_an_override_that_mends_a_file_is_enough(file):
+    path = file(RUN.replace("episodes = ", "episodes = -"))
+    assert load(path, overrides=["episodes=3"]).episodes == 3
