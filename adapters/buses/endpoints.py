@@ -110,6 +110,15 @@ def place_of(endpoint: str) -> tuple[str, int] | None:
     return None if found is None else (found["host"].strip("[]"), int(found["port"]))
 
 
+def folder_of(endpoint: str) -> Path | None:
+    """Return the folder of an endpoint that is a socket.
+
+    >>> folder_of("unixsock-stream/run/k.sock"), folder_of("tcp/127.0.0.1:7447")
+    (PosixPath('run'), None)
+    """
+    return Path(endpoint.removeprefix(UNIX)).parent if endpoint.startswith(UNIX) else None
+
+
 def check_free(endpoint: str) -> None:
     """Look whether one can listen there, without taking anybody's place.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from adapters.replay.tables import replay_tables
 from adapters.results.files import read_json
 from adapters.results.folder import MENDED, MODULES, read_manifest
 from adapters.results.own_code import other_versions
+from adapters.scratch import scratch
 from adapters.stores import Store
 from adapters.versions import versions
 from mape.errors import ConfigError
@@ -212,8 +212,8 @@ def _tables(chosen: argparse.Namespace, folder: Path) -> int:
             f"{option} needs a log, and {folder} has only tables; `mapek up` writes a log, and `mapek step CONFIG "
             "--from PASS` shows a pass of any config"
         )
-    with tempfile.TemporaryDirectory(prefix="mapek-replay-") as scratch:
-        found = replay_tables(folder, manifest, Path(scratch, "run"), workers=chosen.workers, quiet=chosen.quiet)
+    with scratch() as apart:
+        found = replay_tables(folder, manifest, apart / "run", workers=chosen.workers, quiet=chosen.quiet)
     if chosen.json:
         fields = found._asdict()
         _dump({"folder": str(folder), "equal": found.difference is None, **fields,

@@ -6,13 +6,13 @@ import argparse
 import contextlib
 import json
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from adapters.cli.main import dispatch
 from adapters.cli.options import parser
 from adapters.results.folder import read_manifest
+from adapters.scratch import scratch
 from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
 
@@ -66,7 +66,7 @@ def _find_config(again: argparse.Namespace, manifest: dict[str, Any], opened: co
         return
     label, config = next(iter(manifest["agents"].items()))
     # With all that the command line had laid over it; an agent is named once more, for files are named after it.
-    kept = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="mapek-")), "config.json")
+    kept = Path(opened.enter_context(scratch()), "config.json")
     kept.write_text(json.dumps({**config, "agents": {label: {}}}), encoding="utf-8")
     again.config, again.agent = str(kept), label if again.agent else None
     again.profile, again.overrides, again.seed, again.trials, again.engine = None, [], None, None, None

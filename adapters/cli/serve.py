@@ -9,6 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
+from adapters.buses.endpoints import folder_of
 from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, open_folder, prepare
 from adapters.cli.terminal import Clean
@@ -29,7 +30,7 @@ def execute(chosen: argparse.Namespace) -> int:
     prepare()
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(asctime)s %(levelname)s %(message)s")
     logging.getLogger("adapters").setLevel(logging.INFO)  # ours alone: who draws the figures has much to say
-    released = leash() if chosen.leash else None
+    released = leash(folder_of(chosen.listen or chosen.connect or "")) if chosen.leash else None
     try:
         with terminated_by_signal():
             return _serve(chosen, released)

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import sys
-import tempfile
 import time
 from collections import deque
 from pathlib import Path
@@ -20,10 +19,12 @@ from adapters.cli.sentences import sentence
 from adapters.cli.terminal import cleaned
 from adapters.experiments.runner import check
 from adapters.processes.export import export
+from adapters.processes.orphans import wait_for_orphans
 from adapters.processes.serve import Terminated, open_ledger, terminated_by_signal
 from adapters.processes.supervise import Failed, Supervisor, command_of
 from adapters.results import RunFolder
 from adapters.roles import KNOWLEDGE, ROLES
+from adapters.scratch import scratch
 from adapters.stores import LOG_NAME, Swap
 from adapters.systems.declared import is_plant
 from knowledge import from_json
@@ -100,7 +101,7 @@ def _own_endpoint(opened: contextlib.ExitStack) -> str:
     # A socket in a folder that only this user can enter. Its path has to be short, and to have nothing in it that means
     # something in an endpoint; what is named by TMPDIR may be neither.
     for place in (None, "/tmp"):
-        folder = opened.enter_context(tempfile.TemporaryDirectory(prefix="mapek-", dir=place))
+        folder = opened.enter_context(scratch(place))
         endpoint = f"unixsock-stream/{folder}/k.sock"
         with contextlib.suppress(ConfigError):
             check_endpoint(endpoint, anywhere=False)
@@ -121,6 +122,7 @@ def _check(config: Config) -> object:
 def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, folder: RunFolder) -> None:
     logs = folder.path / "logs"
     logs.mkdir(exist_ok=True)
+    wait_for_orphans(folder.path)
     ledger = open_ledger(config, folder.path / LOG_NAME, chosen.durability)
     with ledger.store:
         if ledger.complete:

@@ -20,6 +20,7 @@ from adapters.buses.member import Member
 from adapters.buses.messages import Layout
 from adapters.buses.wire import Wire, versions
 from adapters.processes.supervise import ENDS_WITHIN
+from adapters.scratch import remove_orphan
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
 from mape.config import Config
@@ -77,8 +78,13 @@ def terminated_by_signal() -> Iterator[None]:
         callbacks.removeFilter(not_of_a_signal)
 
 
-def leash() -> threading.Event:
+def leash(folder: Path | None = None) -> threading.Event:
     """End this process when the one that started it is gone: its standard input then ends.
+
+    Parameters
+    ----------
+    folder
+        Where the processes meet; where it is one of `scratch`, which nobody else would remove then.
 
     Returns
     -------
@@ -92,6 +98,8 @@ def leash() -> threading.Event:
         with contextlib.suppress(OSError):
             while os.read(0, 4096):
                 released.set()
+        if folder is not None:
+            remove_orphan(folder)
         os.kill(os.getpid(), signal.SIGTERM)
         # A part may keep to itself what ends it. Nobody else would say the last word now.
         time.sleep(ENDS_WITHIN)

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from adapters.held import held_by
 from adapters.results.chunk import READINGS, read_arrays, read_chunk, remove_parts
 from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
 from adapters.results.own_code import other_versions, own_modules
@@ -193,8 +194,9 @@ class RunFolder:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
+            who = held_by(self._lock)
             self._lock.close()
-            raise ResultsError(f"another run is writing to {path}; wait for it, or choose another --out") from None
+            raise ResultsError(f"another run is writing to {path}{who}; wait for it, or choose another --out") from None
         try:
             self._open(wanted, mended)
         except BaseException:

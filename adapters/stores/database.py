@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self
 
+from adapters.held import held_by
 from mape.errors import ResultsError
 
 
@@ -216,6 +217,7 @@ def _locked(path: Path) -> IO[bytes]:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
+        who = held_by(file)
         file.close()
-        raise ResultsError(f"another Knowledge writes {path}; end it first, or choose another folder") from None
+        raise ResultsError(f"another Knowledge writes {path}{who}; end it first, or choose another folder") from None
     return file
