@@ -525,7 +525,10 @@ def test_what_is_needed_to_make_a_config_of_a_table_is_exported():
         (["system.max_steps=0"], "--set system.max_steps=0, over "),
         (["seed=4", "plan.alhpa=0.3", "episodes=5"], "--set plan.alhpa=0.3, over "),
         (["episodes=5", "episodes=none"], "--set episodes=none, over "),
-        (["episodes=9", "swap=[{pass = 7, part = 'plan', to = 'q_learning'}]", "episodes=6"], "--set episodes=6, over "),
+        (
+            ["episodes=9", "swap=[{pass = 7, part = 'plan', to = 'q_learning'}]", "episodes=6"],
+            "--set episodes=6, over ",
+        ),
     ],
 )
 def test_an_override_that_is_not_legal_is_named_and_not_the_file(file, overrides, blamed):
