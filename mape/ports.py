@@ -103,9 +103,13 @@ class Planner(Protocol):
 class Learner(Protocol):
     """Two pure rules that Numba can compile, and the names of the learning-rate parameters that they take.
 
-    `value(q, rows, count, state, best, epsilon)` is the worth of a state, from which the TD target bootstraps, over the
-    rows ``rows[:count]`` of ``q``, of which `best` is the first with the largest value; `step_size(td_error, rate)` is
-    the learning rate of one update.
+    `value(q, rows, count, state, best, epsilon)` is the worth of a state, from which the TD target bootstraps: `best` is
+    the row of ``q`` that the greedy choice takes there, and ``rows[:count]`` are those of which exploration, whose rate
+    is `epsilon`, takes one at random. `best` is not always among them: a mask limits exploration alone, if the run does
+    not say otherwise. `step_size(td_error, rate)` is the learning rate of one update.
+
+    A learner whose `value` never looks at the rows may say ``on_policy = False``; then they are not sought, which saves
+    time, and may be any.
     """
 
     rate_names: tuple[str, ...]

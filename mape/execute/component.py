@@ -398,6 +398,7 @@ class Execute:
             self._context,
             learner.discount,
             learner.bootstrap_terminal,
+            bool(getattr(learner, "on_policy", True)),  # one that does not say so gets what it may need
             *self._limits,
         )
 

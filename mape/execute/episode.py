@@ -42,6 +42,7 @@ def episode(
     context: Floats,
     discount: float,
     bootstrap_terminal: bool,
+    on_policy: bool,
     mask_greedy: bool,
     reset_draws: int,
     step_draws: int,
@@ -73,6 +74,11 @@ def episode(
         Parameters of `step_size`.
     context
         Means of the system's own signals over the steps; written here.
+    discount, bootstrap_terminal, on_policy
+        The learner's; the last says whether `value` looks at the rows that exploration may choose, which are sought for
+        nobody else.
+    mask_greedy
+        Whether the greedy choice too is among the rows worth exploring, where there are any.
 
     Returns
     -------
@@ -131,16 +137,19 @@ def episode(
         best = -1
         if bootstrap_terminal or not terminated:
             allowed = 0
-            if mask_greedy:
+            if mask_greedy or on_policy:
                 for i in range(count):
                     if explorable(system, phase, next_state, actions[rows[i]]):
                         choices[allowed] = rows[i]
                         allowed += 1
-            if allowed:
+            if mask_greedy and allowed:
                 best = greedy(q, choices, allowed, next_state)
-                bootstrap = value(q, choices, allowed, next_state, best, epsilon)
             else:
                 best = greedy(q, rows, count, next_state)
+            # What exploration may choose there, of which an expectation is taken, is not what the greedy choice may.
+            if allowed:
+                bootstrap = value(q, choices, allowed, next_state, best, epsilon)
+            else:
                 bootstrap = value(q, rows, count, next_state, best, epsilon)
             if next_state == state:
                 best = -1  # the update below changes this very state

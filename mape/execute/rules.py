@@ -1,6 +1,7 @@
 """The rules of learning: pure functions of numbers, in plain Python that Numba can compile.
 
-`q` is a Q-table's values, shape (rows, states); ``rows[:count]`` are the rows that may be used, in the table's order.
+`q` is a Q-table's values, shape (rows, states); ``rows[:count]`` are rows of it, in its order: those among which a rule
+chooses, or, for a learner's `value`, those among which exploration does.
 """
 
 from __future__ import annotations
@@ -37,7 +38,11 @@ def max_value(q: Floats, rows: Ints, count: int, state: int, best: int, epsilon:
 
 
 def expected_value(q: Floats, rows: Ints, count: int, state: int, best: int, epsilon: float) -> float:
-    """Return the mean value of `state` under the epsilon-greedy policy: Expected Sarsa (van Seijen et al. 2009)."""
+    """Return the mean value of `state` under the epsilon-greedy policy: Expected Sarsa (van Seijen et al. 2009).
+
+    With probability 1 - epsilon that policy takes `best`, and else one of ``rows[:count]``, among which `best` need not
+    be: a mask may bar from exploration what the greedy choice is free to take.
+    """
     total = 0.0
     for i in range(count):
         total += q[rows[i], state]
@@ -79,6 +84,11 @@ class QLearning:
         self.config = config
         self.discount = config.discount
         self.bootstrap_terminal = config.bootstrap_terminal
+
+    @property
+    def on_policy(self) -> bool:
+        """Whether `value` may look at the rows that exploration chooses from, as all but the maximum may."""
+        return self.value is not max_value
 
 
 class ExpectedSarsa(QLearning):

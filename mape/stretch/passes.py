@@ -59,6 +59,7 @@ def passes(
     context: Floats,
     discount: float,
     bootstrap_terminal: bool,
+    on_policy: bool,
     mask_greedy: bool,
     reset_draws: int,
     step_draws: int,
@@ -100,7 +101,7 @@ def passes(
             before[k] = state[k]
         status, steps, total, td_error, change = drive(
             first + i, epsilon, at, trace, system, q, touched, journal, saved, used, rows, choices, actions, rate,
-            draws, context, discount, bootstrap_terminal, mask_greedy, reset_draws, step_draws, max_steps,
+            draws, context, discount, bootstrap_terminal, on_policy, mask_greedy, reset_draws, step_draws, max_steps,
         )  # fmt: skip
         if status != OK:
             return

@@ -28,7 +28,9 @@ def probe(
     """Call a learner's rules on many inputs: a template, see `mape.compose`."""
     for i in range(len(states)):
         count, state = 1 + i % len(rows), int(states[i])
-        values[i] = value(q, rows, count, state, greedy(q, rows, count, state), epsilon)
+        # Every other time the greedy row is of all rows, as under a mask that limits exploration alone.
+        best = greedy(q, rows, count if i % 2 else len(rows), state)
+        values[i] = value(q, rows, count, state, best, epsilon)
         sizes[i] = step_size(td_errors[i], rates[i])
     return len(states)
 
@@ -74,6 +76,24 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
         if not (np.array_equal(given[6], again[6]) and np.array_equal(given[7], again[7])):
             raise Broken("the same numbers gave two results; rules keep nothing and draw nothing")
 
+    def says_what_it_looks_at() -> None:
+        learner = make()
+        on_policy = getattr(learner, "on_policy", True)
+        if type(on_policy) is not bool:
+            raise Broken(f"on_policy is {on_policy!r}; it is True or False, or left out, which stands for True")
+        if on_policy:
+            return
+        q, rows, states, epsilon, *_ = inputs(learner)
+        plain = np.errstate(all="ignore")(learner.value)
+        for state in states.tolist():
+            best = greedy(q, rows, len(rows), state)
+            given = {plain(q, rows[first:], len(rows) - first, state, best, epsilon) for first in range(len(rows))}
+            if len(given) > 1:
+                raise Broken(
+                    f"on_policy is False, and value gives {sorted(given)} for one state and greedy row over other rows: "
+                    "it looks at them. Say on_policy = True, so that they are those which exploration chooses from"
+                )
+
     def same_bits() -> None:
         learner = make()
         plain, compiled = inputs(learner), inputs(learner)
@@ -93,6 +113,7 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
         [
             ("names its learning-rate parameters, a discount and bootstrap_terminal", constants),
             ("has pure rules with finite results", pure),
+            ("says whether its value looks at what exploration chooses from", says_what_it_looks_at),
             ("gives the same bits compiled as in plain Python", same_bits),
         ],
     )
