@@ -73,10 +73,11 @@ class RulesEnvironment(gymnasium.Env[Observation, SupportsInt], ABC, Generic[Obs
 
     - ``available_actions``: ids of the actions that this episode offers, a tuple of int;
     - ``action_mask``: int8 array, shape (n_actions,): available, and worth exploring in this state;
+    - ``legal_actions``: ids of those that may be taken in this state, of rules that say so;
     - ``signals``: dict of this step's own signals, from `step` of a system that has any.
 
-    An action that is not available raises instead of doing something else in silence: a learner that takes one
-    would otherwise learn the value of an action that never happened. `action_space.sample` never draws one.
+    An action that is not available, or not legal, raises instead of doing something else in silence: a learner that
+    takes one would otherwise learn the value of an action that never happened. `action_space.sample` never draws one.
 
     A reset without options counts: the first is episode 1, the next one more than the last, whether counted or given.
 
@@ -164,7 +165,8 @@ class RulesEnvironment(gymnasium.Env[Observation, SupportsInt], ABC, Generic[Obs
         gymnasium.error.ResetNeeded
             No episode is under way.
         UnavailableAction
-            The action is not available in this episode. It is a ValueError, and Gymnasium's InvalidAction.
+            The action is not available in this episode, or not legal in this state. It is a ValueError, and
+            Gymnasium's InvalidAction.
         """
         if not self._running:
             raise ResetNeeded("no episode is under way; call reset() before the first step and after each episode")
@@ -174,6 +176,11 @@ class RulesEnvironment(gymnasium.Env[Observation, SupportsInt], ABC, Generic[Obs
                 f"{self._actions.available} (info['available_actions'])"
             )
         rules = self._rules
+        if action not in self._legal():
+            raise UnavailableAction(
+                f"action {action!r} is not legal in state {self._state} of episode {self._episode}; legal are "
+                f"{self._legal()} (info['legal_actions'])"
+            )
         context = np.zeros(len(rules.signal_names))
         at = rules.reset_draws + self._steps * rules.step_draws
         self._state, reward, terminated = rules.step(
@@ -215,7 +222,16 @@ class RulesEnvironment(gymnasium.Env[Observation, SupportsInt], ABC, Generic[Obs
         mask = np.zeros(rules.n_actions, dtype=np.int8)
         for action in self._actions.available:
             mask[action] = rules.explorable(rules.params, self._phase, self._state, action)
-        return {"available_actions": self._actions.available, "action_mask": mask}
+        told: dict[str, Any] = {"available_actions": self._actions.available, "action_mask": mask}
+        if rules.legal is not None:
+            told["legal_actions"] = self._legal()
+        return told
+
+    def _legal(self) -> tuple[int, ...]:
+        rules, available = self._rules, self._actions.available
+        if rules.legal is None:
+            return available
+        return tuple(action for action in available if rules.legal(rules.params, self._phase, self._state, action))
 
     def _block(self, uniforms: object) -> FloatArray:
         """Check and copy the uniforms of one episode, shape (at least `episode_draws`,)."""

@@ -43,6 +43,8 @@ class Rules(NamedTuple):
     windows : int64 array, shape (n_actions, 2): first and last episode (1-based, inclusive) of each action. Live:
         the environment writes it when actions are enabled.
     drifts : episodes from which a new phase holds. The truth, for evaluation; a manager must not read it.
+    legal : ``legal(params, phase, state, action) -> bool``, whether the action may be taken here at all; None where
+        every action that is available may.
 
     Examples
     --------
@@ -77,6 +79,7 @@ class Rules(NamedTuple):
     signal_names: tuple[str, ...]
     windows: IntArray
     drifts: tuple[int, ...]
+    legal: Callable[[Any, int, int, int], bool] | None = None
 
     @property
     def episode_draws(self) -> int:

@@ -10,9 +10,10 @@ merged.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -74,6 +75,8 @@ class BoxGrid(PartConfig):
         for low, high, bins in zip(self.low, self.high, self.bins, strict=True):
             if not low < high or bins < 1:
                 raise ValueError(f"low = {low}, high = {high}, bins = {bins}: low is below high, bins at least 1")
+            if math.isinf(high - low):
+                raise ValueError(f"low = {low}, high = {high}: they are too far apart for a float; bring them together")
         return self
 
 
@@ -92,6 +95,12 @@ class SystemConfig(PartConfig):
     )
     redrivable: bool | None = Field(
         None, description="whether an episode can be driven again after others; by default as the system says, or true"
+    )
+
+    reset_takes: tuple[Literal["seed", "options"], ...] = Field(
+        ("seed", "options"),
+        description="what the environment's reset is given; leave out what it does not take. Without a seed no episode "
+        "can be driven again, if redrivable does not say otherwise",
     )
 
     @model_validator(mode="after")
@@ -146,6 +155,12 @@ class ExecuteConfig(PartConfig):
             raise ValueError(
                 f"rate = {self.rate} paces a free-running system; in lockstep each episode waits for its plan, and "
                 "nothing else sets the pace. Leave rate out, or choose mode = 'free'"
+            )
+        held = type(self).model_fields["backlog"].default
+        if self.mode == "lockstep" and self.backlog != held:
+            raise ValueError(
+                f"backlog = {self.backlog} is of a free-running system; in lockstep no observation is held back. Leave "
+                "backlog out, or choose mode = 'free'"
             )
         return self
 

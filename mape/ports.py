@@ -103,10 +103,10 @@ class Planner(Protocol):
 class Learner(Protocol):
     """Two pure rules that Numba can compile, and the names of the learning-rate parameters that they take.
 
-    `value(q, rows, count, state, best, epsilon)` is the worth of a state, from which the TD target bootstraps: `best` is
-    the row of ``q`` that the greedy choice takes there, and ``rows[:count]`` are those of which exploration, whose rate
-    is `epsilon`, takes one at random. `best` is not always among them: a mask limits exploration alone, if the run does
-    not say otherwise. `step_size(td_error, rate)` is the learning rate of one update.
+    `value(q, rows, count, state, best, epsilon)` is the worth of a state, from which the TD target bootstraps: `best`
+    is the row of ``q`` that the greedy choice takes there, and ``rows[:count]`` are those of which exploration, whose
+    rate is `epsilon`, takes one at random. `best` is not always among them: a mask limits exploration alone, if the run
+    does not say otherwise. `step_size(td_error, rate)` is the learning rate of one update.
 
     A learner whose `value` never looks at the rows may say ``on_policy = False``; then they are not sought, which saves
     time, and may be any.
@@ -124,6 +124,10 @@ class StepRules(Protocol):
 
     The rules take their randomness as uniforms on [0, 1): `reset` reads ``draws[at : at + reset_draws]``, a `step`
     ``draws[at : at + step_draws]``. A step adds its values of the system's own signals to `context`.
+
+    They may have `legal`, ``(params, phase, state, action) -> bool``: whether an action may be taken there at all. What
+    is not legal is neither explored, nor chosen greedily, nor bootstrapped from. `explorable` is softer: it bars an
+    action from exploration alone, where there is another.
     """
 
     @property
@@ -155,9 +159,15 @@ class Episode(NamedTuple):
 class ManagedSystem(Protocol):
     """What Execute drives. States are indices below `n_states`, actions stable integers below `max_actions`.
 
-    A system may also have ``held(stated=False)``, which returns name -> fingerprint of what it holds: after two equal
-    resets the same, where it carries nothing beside what `get_state` says (with `stated`, nothing at all). What differs
-    is named by `mapek check`, and keeps a restarted process from going on with a state that does not tell it.
+    It may also have
+
+    - `legal_actions`, a frozenset of the ids that may be taken in the present state at all, or None where all that are
+      offered may;
+    - `taken`, the id of the action that the last step took in the place of the chosen one, or None: the update is then
+      that action's;
+    - ``held(stated=False)``, which returns name -> fingerprint of what it holds: after two equal resets the same, where
+      it carries nothing beside what `get_state` says (with `stated`, nothing at all). What differs is named by `mapek
+      check`, and keeps a restarted process from going on with a state that does not tell it.
     """
 
     name: str

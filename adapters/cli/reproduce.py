@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
 from adapters.experiments import paper
+from adapters.experiments.decimals import plain
 from adapters.experiments.metrics import (
     Detection,
     convergence,
@@ -199,7 +200,7 @@ def _with_sd(mean: float, sd: float | None) -> str:
 
 def _short(number: float) -> str:
     """Leave out the decimals of what is so long that the columns would not hold it."""
-    return f"{number:,.2f}" if abs(number) < 1e5 else f"{number:,.0f}"
+    return plain(number, 2 if abs(number) < 1e5 else 0)
 
 
 def _print_comparison(chosen: argparse.Namespace, against: Comparison) -> None:

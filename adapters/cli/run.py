@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
 from adapters.cli.sentences import sentence
+from adapters.experiments.decimals import plain
 from adapters.experiments.runner import run_agents
 from adapters.experiments.statistics import summary
 from adapters.systems.lending import Lender
@@ -121,7 +122,7 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
 
 
 def _with_sd(found: Any) -> str:
-    return f"{found.mean:,.2f}" if found.sd is None else f"{found.mean:,.2f} ± {found.sd:,.2f}"
+    return plain(found.mean) if found.sd is None else f"{plain(found.mean)} ± {plain(found.sd)}"
 
 
 def _shower(chosen: argparse.Namespace, first: int, last: int) -> Any:

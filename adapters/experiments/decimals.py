@@ -44,3 +44,12 @@ def number(value: float, resolution: float, sign: str = "-") -> str:
     if (decimals > MOST and 0.0 < abs(value) < 1e-3) or abs(value) >= LARGE:
         return f"{value:{sign}.3e}"
     return f"{value:{sign}z,.{min(MOST, decimals)}f}"
+
+
+def plain(value: float, decimals: int = 2) -> str:
+    """Write a number with thousands separated and a fixed number of decimals, or with a power of ten where it is large.
+
+    >>> plain(-1234.5), plain(123456.78, 0), plain(1e200)
+    ('-1,234.50', '123,457', '1.000e+200')
+    """
+    return f"{value:,.{decimals}f}" if abs(value) < LARGE else f"{value:.3e}"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
 import warnings
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium
@@ -11,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
+from adapters.systems import answers
 from adapters.systems.gymnasium_system import GymnasiumSystem, connect, make_env, make_system, rules_of
 from managed_systems import register_envs
 from mape.config import BoxGrid, SystemConfig
@@ -89,11 +93,47 @@ def _span(low: float, high: float) -> tuple[float, float]:
     return (low, high) if low < high else (low - abs(low) - 1.0, high + abs(high) + 1.0)
 
 
+@contextlib.contextmanager
+def _legally(env: Any) -> Iterator[None]:
+    """Let no step of an environment take an action that its ``info["legal_actions"]`` bars: a legal one is taken."""
+    name, reset, step = type(env).__name__, env.reset, env.step
+    legal: list[int] = []
+
+    def look(info: Any) -> None:
+        legal.clear()
+        if isinstance(info, Mapping) and "legal_actions" in info:
+            space = env.action_space
+            actions = range(int(space.start), int(space.start + space.n))
+            legal.extend(sorted(answers.legal(name, info["legal_actions"], actions)))
+
+    @functools.wraps(reset)
+    def looked_at_reset(*arguments: Any, **options: Any) -> Any:
+        answer = reset(*arguments, **options)
+        look(answer[1] if isinstance(answer, tuple) and len(answer) == 2 else None)
+        return answer
+
+    @functools.wraps(step)
+    def legal_step(action: Any) -> Any:
+        answer = step(action if not legal or action in legal else legal[int(action) % len(legal)])
+        look(answer[-1] if isinstance(answer, tuple) else None)
+        return answer
+
+    env.reset, env.step = looked_at_reset, legal_step
+    try:
+        yield
+    finally:
+        del env.reset, env.step
+
+
 def check_environment(config: SystemConfig) -> Finding:
     """Run Gymnasium's own checker over the environment, and return what it says as a finding."""
+    if {*config.reset_takes} != {"seed", "options"}:
+        return Finding(
+            CHECK_ENV, "note", f"not asked, as its reset takes {list(config.reset_takes)} (system.reset_takes)"
+        )
     env = make_env(config)
     try:
-        with warnings.catch_warnings(record=True) as said:
+        with warnings.catch_warnings(record=True) as said, _legally(env.unwrapped):
             warnings.simplefilter("always")
             connect(env)
             check_env(env.unwrapped, skip_render_check=True)

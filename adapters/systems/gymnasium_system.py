@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import inspect
 from typing import Any
 
@@ -11,17 +12,19 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from adapters.systems import answers
 from adapters.systems.held import held
 from adapters.systems.refusals import refusal
 from adapters.systems.state_index import state_index
 from adapters.systems.tabulated import Tabulated
-from adapters.systems.wrappers import altering_wrapper, least_cap, step_caps
+from adapters.systems.wrappers import altering_wrapper, step_cap, step_caps
 from managed_systems import register_envs
 from managed_systems.rules import available
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
 from mape.states import faults, told
+from mape.values import ids, shown, truth
 
 _RULES = tuple(name for name in vars(StepRules) if not name.startswith("_"))
 
@@ -119,18 +122,25 @@ class GymnasiumSystem:
         self.n_states, self._index = state_index(env.observation_space, config.discretise, self.name)
         self.rules: StepRules | None = rules_of(env)
         rules: Any = _own_rules(self._base)  # what they declare holds below any wrapper
-        self.max_steps = least_cap(self.name, [config.max_steps, getattr(rules, "max_steps", None), *step_caps(env)])
-        self.signal_names: tuple[str, ...] = tuple(
-            getattr(rules, "signal_names", getattr(self._base, "signal_names", ()))
-        )
-        self.drifts: tuple[int, ...] = tuple(getattr(rules, "drifts", getattr(self._base, "drifts", ())))
+        self.max_steps = step_cap(self.name, config.max_steps, [getattr(rules, "max_steps", None), *step_caps(env)])
+        self.signal_names = _names(self.name, getattr(rules, "signal_names", getattr(self._base, "signal_names", ())))
+        self.drifts = _episodes(self.name, getattr(rules, "drifts", getattr(self._base, "drifts", ())))
         self.draws: tuple[int, int] = (0, 0)
         if self.rules is not None:
             self.draws = (self.rules.reset_draws, self.rules.step_draws)
-        declared_redrivable = getattr(self._base, "redrivable", True)  # every reset is seeded
-        self.redrivable = bool(declared_redrivable if config.redrivable is None else config.redrivable)
+        self._takes = config.reset_takes
+        _give_reset(self.name, self._base, self._takes, rules is not None)
+        said = getattr(self._base, "redrivable", "seed" in self._takes)
+        declared_redrivable = truth(said)
+        if declared_redrivable is None:
+            raise ConfigError(f"{self.name} says redrivable = {said!r}; it is True or False")
+        self.redrivable = declared_redrivable if config.redrivable is None else config.redrivable
         self._block = getattr(self.rules, "episode_draws", 0)
-        self._mask: npt.NDArray[np.int8] | None = None
+        self.legal_actions: frozenset[int] | None = None
+        self.taken: int | None = None
+        self._hard = False  # whether this episode says which actions are legal
+        self._teaches_nothing = rules is not None  # a mask of zeros is then no more than that, in both engines
+        self._mask: Any = None
         self._actions = self._action_range()
         self._windows: tuple[int, int, tuple[int, ...]] | None = None
         self._connected = False
@@ -160,7 +170,8 @@ class GymnasiumSystem:
         Raises
         ------
         ManagedSystemError
-            It cannot be connected, offers an action that its action space does not have, or a mask of another length.
+            It cannot be connected, or returned something else than a reset does, or what it returned is outside of
+            what it declares: its observation, the actions that it offers, or those that are legal.
         """
         if not self._connected:
             self._connect(episode.number)
@@ -170,20 +181,21 @@ class GymnasiumSystem:
             uniforms = np.zeros(max(self._block, len(episode.uniforms)))
             uniforms[: len(episode.uniforms)] = episode.uniforms
             options["uniforms"] = uniforms
-        seen, info = self.env.reset(seed=episode.seed, options=options)
+        try:
+            answer: Any = self.env.reset(seed=episode.seed, options=options)
+        except faults() as error:
+            answers.refuse_old_api(self.name, error)
+            raise self._strict(error) from error
+        seen, info = answers.reset_answer(self.name, answer)
         self._actions = self._action_range()
-        self._see_mask(info)
+        self._hard = "legal_actions" in info
+        self.taken = None
+        self._see(info, terminated=False)
         state = self._index(seen)
         if "available_actions" not in info:
             return state, tuple(self._actions)
-        offered = tuple(int(action) for action in info["available_actions"])
-        for action in offered:
-            if action not in self._actions:
-                raise ManagedSystemError(
-                    f"{self.name} offers action {action} in info['available_actions'] = {offered} of episode "
-                    f"{episode.number}; its action space has {self._actions[0]} .. {self._actions[-1]}"
-                )
-        return state, offered
+        of = f" of episode {episode.number}"
+        return state, answers.action_ids(self.name, "available_actions", info["available_actions"], self._actions, of)
 
     def step(self, action: int, context: npt.NDArray[np.float64]) -> tuple[int, float, bool, bool]:
         """Act; return next state, reward, terminated, truncated.
@@ -191,24 +203,25 @@ class GymnasiumSystem:
         Raises
         ------
         ManagedSystemError
-            A signal that it declares is missing, or its mask is of another length than its action space.
+            It returned something else than a step does, or what it returned is outside of what it declares: its
+            observation, reward, signals, mask, or the actions that are legal.
         """
-        seen, reward, terminated, truncated, info = self.env.step(action)
-        self._see_mask(info)
+        try:
+            answer: Any = self.env.step(action)
+        except faults() as error:
+            answers.refuse_old_api(self.name, error)
+            raise
+        seen, reward, terminated, truncated, info = answers.step_answer(self.name, answer)
+        self._see(info, terminated)
+        taken = info.get("action_taken")
+        self.taken = None if taken is None else answers.taken(self.name, taken, self._actions)
         if self.signal_names:
-            signals = info.get("signals", {})
-            for k, name in enumerate(self.signal_names):
-                if name not in signals:
-                    raise ManagedSystemError(
-                        f"{self.name} declares signal {name!r} and did not put it into info['signals']; got "
-                        f"{', '.join(signals) or 'none'}"
-                    )
-                context[k] += float(signals[name])
-        return self._index(seen), float(reward), bool(terminated), bool(truncated)
+            answers.signals(self.name, self.signal_names, info, context)
+        return self._index(seen), reward, terminated, truncated
 
     def explorable(self, action: int) -> bool:
         """Look the action up in the present state's ``info["action_mask"]``; without one, all may be tried."""
-        return self._mask is None or bool(self._mask[action - self._actions.start])
+        return self._mask is None or answers.marked(self.name, self._mask, action - self._actions.start)
 
     def enable(self, actions: tuple[int, ...]) -> None:
         """Switch reserve actions on.
@@ -274,11 +287,87 @@ class GymnasiumSystem:
         space: Any = self.env.action_space
         return range(int(space.start), int(space.start + space.n))
 
-    def _see_mask(self, info: dict[str, Any]) -> None:
-        self._mask = mask = info.get("action_mask")
-        # An array is asked itself: NumPy's function takes a while, in each step.
-        if mask is not None and getattr(mask, "shape", None) != (len(self._actions),) != np.shape(mask):
+    def _see(self, info: answers.Info, terminated: bool) -> None:
+        self._mask = marks = info.get("action_mask")
+        if marks is not None:
+            answers.mask(self.name, marks, self._actions)
+            if not terminated and not self._teaches_nothing:
+                answers.refuse_empty_mask(self.name, marks, self._actions)
+        if "legal_actions" not in info and (terminated or not self._hard):
+            self.legal_actions = None
+            return
+        if not self._hard or "legal_actions" not in info:
+            here, there = ("a step", "the reset") if "legal_actions" in info else ("the reset", "a step")
             raise ManagedSystemError(
-                f"{self.name} gave an info['action_mask'] of shape {np.shape(mask)}; it has a mark for each of "
-                f"{len(self._actions)} actions, shape ({len(self._actions)},)"
+                f"{self.name} gave info['legal_actions'] at {here} and none at {there} of the same episode; what is "
+                "legal is said at the reset and at each step, or never"
             )
+        self.legal_actions = answers.legal(self.name, info["legal_actions"], self._actions)
+        if not self.legal_actions and not terminated:
+            raise ManagedSystemError(
+                f"{self.name} gave info['legal_actions'] = {shown(info['legal_actions'])} in a state that is not "
+                "terminal; one action at least is legal there, such as one that waits"
+            )
+
+    def _strict(self, error: BaseException) -> BaseException:
+        """Return an error of the reset, with the way out where it may be about what the reset was given."""
+        if not any(word in str(error) for word in ("option", "episode", "uniforms", "seed", "keyword")):
+            return error
+        return ManagedSystemError(
+            f"{self.name} raised {told(error)} from reset(), which was given {' and '.join(self._takes) or 'nothing'}. "
+            "If it takes less, name what it takes: system.reset_takes = ['seed'], or []"
+        )
+
+
+def _reset_with(reset: Any, takes: tuple[str, ...], *, seed: int | None = None, options: Any = None) -> Any:
+    given = {"seed": seed, "options": options}
+    return reset(**{name: given[name] for name in takes})
+
+
+def _give_reset(name: str, base: Any, takes: tuple[str, ...], needs_uniforms: bool) -> None:
+    """Let an environment's reset be given no more than it takes.
+
+    Raises
+    ------
+    ConfigError
+        It takes less than that, or its rules need what would be kept from them.
+    """
+    _check_reset(name, base.reset, takes, needs_uniforms)
+    if {*takes} != {"seed", "options"}:
+        # Below the wrappers, which hand on both.
+        base.reset = functools.partial(_reset_with, base.reset, takes)
+
+
+def _check_reset(name: str, reset: Any, takes: tuple[str, ...], needs_uniforms: bool) -> None:
+    if needs_uniforms and "options" not in takes:
+        raise ConfigError(
+            f"system.reset_takes = {list(takes)} leaves out options, by which {name} is given its randomness; leave it "
+            "as it is by default"
+        )
+    try:
+        parameters = inspect.signature(reset).parameters
+    except (TypeError, ValueError):  # one that is not written in Python
+        return
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return
+    missing = [word for word in takes if word not in parameters]
+    if missing:
+        known = [word for word in takes if word in parameters]
+        raise ConfigError(
+            f"the reset of {name} takes no {' and no '.join(missing)}. Set system.reset_takes = {known}, which gives "
+            "it no more than it takes, or let it have them, as Gymnasium's reset(*, seed=None, options=None)"
+        )
+
+
+def _names(name: str, declared: Any) -> tuple[str, ...]:
+    names = None if isinstance(declared, str) else tuple(declared)
+    if names is None or not all(isinstance(signal, str) for signal in names):
+        raise ConfigError(f"{name} declares signal_names = {declared!r}; it is a tuple of names, such as ('load',)")
+    return names
+
+
+def _episodes(name: str, declared: Any) -> tuple[int, ...]:
+    episodes = ids(declared)
+    if episodes is None:
+        raise ConfigError(f"{name} declares drifts = {declared!r}; it is a tuple of episodes, such as (301,)")
+    return episodes

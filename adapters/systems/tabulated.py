@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import operator
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -17,12 +16,13 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Discrete
 
-from adapters.systems.wrappers import altering_wrapper, least_cap, step_caps
+from adapters.systems.wrappers import altering_wrapper, step_cap, step_caps
 from managed_systems import drawing
 from managed_systems.environment import RulesEnvironment
 from managed_systems.rules import ALWAYS, FloatArray, IntArray, Rules
 from mape.errors import ConfigError
 from mape.states import faults, told
+from mape.values import number, shown, truth, whole
 
 WITH_TABLE = ("CliffWalking-v1", "CliffWalkingSlippery-v1", "FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4")
 """Gymnasium's own ids that show their table."""
@@ -123,14 +123,15 @@ class Tabulated(RulesEnvironment[int]):
     env
         The environment, bare or with wrappers that change nothing but the number of steps.
     max_steps
-        Steps after which an episode is truncated. The least of this and the environment's own caps holds.
+        Steps after which an episode is truncated: at most the environment's own cap, which holds by default.
     render_mode
         ``"ansi"``, ``"rgb_array"`` or None.
 
     Raises
     ------
     ConfigError
-        The environment shows no table, or a malformed one, or does more than that says; or no step cap is known.
+        The environment shows no table, or a malformed one, or does more than that says; or no step cap is known, or
+        one that is less than `max_steps`.
     ValueError
         `render_mode` is not one of those.
 
@@ -158,7 +159,7 @@ class Tabulated(RulesEnvironment[int]):
             explorable=explorable,
             n_states=n_states,
             n_actions=n_actions,
-            max_steps=least_cap(name, [max_steps, *step_caps(env)]),
+            max_steps=step_cap(name, max_steps, step_caps(env)),
             reset_draws=1,
             step_draws=1,
             signal_names=(),
@@ -218,13 +219,14 @@ def _read(base: Any, name: str) -> TableParams:
     n_states, n_actions = int(base.observation_space.n), int(base.action_space.n)
     first = [0]
     found: list[tuple[float, int, float, bool]] = []
+    row: list[Any]
     for state, action in itertools.product(range(n_states), range(n_actions)):
         where = f"P[{state}][{action}] of {name}"
         try:
-            row = [(float(p), operator.index(s), float(r), bool(ends)) for p, s, r, ends in base.P[state][action]]
-        except (LookupError, TypeError, ValueError, OverflowError):
+            row = [(number(p), whole(s), number(r), truth(ends)) for p, s, r, ends in base.P[state][action]]
+        except (LookupError, TypeError, ValueError):
             row = []
-        if not row:
+        if not row or any(None in outcome for outcome in row):
             raise ConfigError(
                 f"{where} is no list of outcomes (probability, next state, reward, terminated); each of {n_states} "
                 f"states has one for each of {n_actions} actions"
@@ -280,11 +282,13 @@ def _mask(base: Any, n_states: int, n_actions: int, name: str) -> npt.NDArray[np
     if not callable(getattr(base, "action_mask", None)):
         return np.ones((n_states, n_actions), np.bool_)
     try:
-        mask = np.array([base.action_mask(state) for state in range(n_states)], np.bool_)
+        mask = np.array([base.action_mask(state) for state in range(n_states)])
     except faults() as error:  # whatever it is that somebody else calls so
         raise ConfigError(f"action_mask(state) of {name} gives no marks: {told(error)}") from error
     if mask.shape != (n_states, n_actions):
         raise ConfigError(
             f"action_mask of {name} gives {mask.shape[1:]} marks for a state; give one for each of {n_actions} actions"
         )
-    return mask
+    if mask.dtype.kind not in "biu" or not np.isin(mask, (0, 1)).all():
+        raise ConfigError(f"action_mask of {name} gives marks such as {shown(mask.flat[0])}; a mark is 0 or 1")
+    return mask.astype(np.bool_)

@@ -36,17 +36,23 @@ def step_caps(env: gymnasium.Env[Any, Any]) -> list[int | None]:
     return caps
 
 
-def least_cap(name: str, caps: Iterable[int | None]) -> int:
-    """Return the least of the caps that there are.
+def step_cap(name: str, asked: int | None, own: Iterable[int | None]) -> int:
+    """Return the longest episode that is asked for, or else the least of the caps that the environment has.
 
     Raises
     ------
     ConfigError
-        There is none.
+        There is none; or more steps are asked for than the environment's own cap lets be.
     """
-    found = [cap for cap in caps if cap is not None]
-    if not found:
+    found = [cap for cap in own if cap is not None]
+    if asked is not None and found and asked > min(found):
+        raise ConfigError(
+            f"system.max_steps = {asked}, and the episodes of {name} end after {min(found)} steps by a cap of its own. "
+            f"Give at most {min(found)}, or leave it out; the environment's cap is raised where it stands: by "
+            f"system.options.max_episode_steps where Gymnasium registers it, or by an option of the environment"
+        )
+    if asked is None and not found:
         raise ConfigError(
             f"{name} has no step cap of its own, and an episode must end; set system.max_steps, such as 200"
         )
-    return int(min(found))
+    return int(min(found)) if asked is None else asked

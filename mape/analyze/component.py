@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from knowledge import ChangeRequest, Symptom
+from knowledge import ChangeRequest, Drift, Symptom
+from knowledge.rows import DIRECTIONS
 from mape.errors import PartError
 from mape.ports import Analyzer, Json
 from mape.states import faults, hand_over, restore, state_of, told
+from mape.values import shown
 
 
 class Analyze:
@@ -31,7 +33,7 @@ class Analyze:
         Raises
         ------
         PartError
-            The analyzer raised, or gave no change request.
+            The analyzer raised, or gave no change request, or one of what its symptom does not tell.
         """
         try:
             request = self.analyzer.analyze(symptom)
@@ -44,7 +46,36 @@ class Analyze:
                 f"analyzer {type(self.analyzer).__name__} returned {request!r} at pass {symptom.pass_no}; an analyzer "
                 "returns a ChangeRequest"
             )
+        if request.drifts or request.added or request.removed:  # in few passes
+            self._check_changes(request, symptom)
         self._send(request)
+
+    def _check_changes(self, request: ChangeRequest, symptom: Symptom) -> None:
+        _, _, drifts, added, removed, signals = request
+        if not isinstance(drifts, tuple) or not all(
+            type(drift) is Drift and drift.signal in signals and drift.direction in DIRECTIONS for drift in drifts
+        ):
+            raise self._refused(
+                symptom,
+                f"drifts = {shown(drifts)}; it is a tuple of Drift, each of one of the signals {', '.join(signals)}, "
+                f"and to one of the sides {', '.join(DIRECTIONS)}",
+            )
+        available, known = symptom.available, symptom.known
+        for name, actions, legal in (
+            ("added", added, [action for action in available if action not in known]),
+            ("removed", removed, [action for action in known if action not in available]),
+        ):
+            if not isinstance(actions, tuple) or not all(type(a) is int and a in legal for a in actions):
+                raise self._refused(
+                    symptom,
+                    f"{name} = {shown(actions)} with {available} available and {known} known; it is a tuple of some of "
+                    f"{tuple(legal)}",
+                )
+
+    def _refused(self, symptom: Symptom, why: str) -> PartError:
+        return PartError(
+            f"analyzer {type(self.analyzer).__name__} gave a request at pass {symptom.pass_no} that does not fit: {why}"
+        )
 
     def state(self) -> Json:
         """Return the analyzer's state: all that is carried from pass to pass.

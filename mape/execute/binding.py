@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 
 from mape.compose import Bindings, Composed, Rule, Uncompilable, specialise
+from mape.errors import PartError
 from mape.execute import drive, episode
+from mape.execute import rules as own
 from mape.ports import Learner, StepRules
+from mape.states import faults, told
+from mape.values import number, shown
 
 Driver = Callable[..., tuple[int, int, float, float, float]]
 """`episode.episode` with its free names bound."""
@@ -46,7 +50,8 @@ def _named(error: Uncompilable, learner: Learner) -> Uncompilable:
 
 def composed(rules: StepRules, learner: Learner) -> Composed:
     """Return the episode with its names bound to the rules of a system and a learner; equal ones are one object."""
-    return _composed(rules.phase, rules.reset, rules.step, rules.explorable, learner.value, learner.step_size)
+    legal = getattr(rules, "legal", None)
+    return _composed(rules.phase, rules.reset, rules.step, legal, rules.explorable, learner.value, learner.step_size)
 
 
 @functools.cache
@@ -56,12 +61,19 @@ def _compiled(bound: Composed) -> Any:
 
 
 @functools.cache
-def _composed(phase: Rule, reset: Rule, step: Rule, explorable: Rule, value: Rule, step_size: Rule) -> Composed:
+def _composed(
+    phase: Rule, reset: Rule, step: Rule, legal: Rule | None, explorable: Rule, value: Rule, step_size: Rule
+) -> Composed:
     begin = Composed(drive.begin_by_rules, {"phase_rule": phase, "reset_rule": reset})
     act = Composed(drive.act_by_rules, {"step_rule": step})
+    narrow: Any = drive.all_are_legal
+    if legal is not None:
+        narrow = Composed(drive.narrow_by_rules, {"legal_rule": legal})
     bound: Bindings = {
         "begin": begin,
+        "narrow": narrow,
         "act": act,
+        "credit": drive.credit_as_chosen,
         "explorable": explorable,
         "value": value,
         "step_size": step_size,
@@ -69,14 +81,36 @@ def _composed(phase: Rule, reset: Rule, step: Rule, explorable: Rule, value: Rul
     return Composed(episode.episode, bound, apart=True)
 
 
+def _told_apart(learner: Learner, name: str) -> Rule:
+    """Return a learner's rule so that what it raises, or gives in the place of a number, is told as the learner's."""
+    rule: Any = getattr(learner, name)
+    if rule.__module__ == own.__name__:
+        return rule  # type: ignore[no-any-return]
+
+    def looked_at(*arguments: Any) -> Any:
+        try:
+            given = rule(*arguments)
+        except faults() as error:
+            raise PartError(f"{name} of learner {type(learner).__name__} raised {told(error)}") from error
+        if isinstance(given, float):
+            return given
+        if (as_float := number(given)) is None:
+            raise PartError(f"{name} of learner {type(learner).__name__} gave {shown(given)}; it gives one real number")
+        return as_float
+
+    return looked_at
+
+
 def by_calls(learner: Learner) -> Driver:
     """Return the episode as plain Python that calls the system's `step`."""
     bound: Bindings = {
         "begin": drive.begin_by_calls,
+        "narrow": drive.narrow_by_calls,
         "act": drive.act_by_calls,
+        "credit": drive.credit_by_calls,
         "explorable": drive.explorable_by_calls,
-        "value": learner.value,
-        "step_size": learner.step_size,
+        "value": _told_apart(learner, "value"),
+        "step_size": _told_apart(learner, "step_size"),
     }
     plain = Composed(episode.episode, bound).python()
 

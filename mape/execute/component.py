@@ -13,12 +13,13 @@ from knowledge import ChangePlan, Knowledge, Observation, QTable
 from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
 from mape.execute import adoption, binding, drive, episode
 from mape.execute.checkpoint import Checkpoint, Held, carried_by, differing, held_by, take_up
-from mape.execute.refusals import check_offer, refused
+from mape.execute.refusals import broken_off, check_offer, refused
 from mape.execute.rules import rate_array
 from mape.execute.uniforms import Uniforms
 from mape.execute.workspace import Workspace
 from mape.ports import Episode, Json, Learner, ManagedSystem
 from mape.states import STOPS, faults, told
+from mape.values import shown, whole
 
 SIGNALS = ("return", "steps", "td_error", "q_change")
 """Signals of every run: return, steps, mean |TD error|, largest absolute change of Q; the system's own follow."""
@@ -104,7 +105,7 @@ class Execute:
         self._system_draws = reset_draws + cap * step_draws
         self.uniforms = Uniforms(seed, (loop, trial), self._system_draws + 2 * cap)
 
-        self._workspace = Workspace(cap)
+        self._workspace = Workspace(cap, self.rules is None or getattr(self.rules, "legal", None) is not None)
         self._context = np.zeros(len(system.signal_names))
         self._no_trace = np.empty((0, len(episode.TRACE_COLUMNS)))
         self._limits = (mask_greedy, reset_draws, step_draws, cap)
@@ -210,17 +211,15 @@ class Execute:
             status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
         except BaseException as error:
             self._workspace.roll_back()
-            if isinstance(error, (MapekError, *STOPS)):
+            contract = isinstance(error, (ManagedSystemError, PartError))
+            if not contract and isinstance(error, (MapekError, *STOPS)):
                 raise
             if (steps := int(self._workspace.used[1])) < 0:
                 raise self._failed_to_reset(error, number) from error
-            raise ManagedSystemError(
-                f"{self.system.name} raised {told(error)}, in episode {number} at step {steps + 1}. "
-                f"Nothing of that episode was learnt; the {self.passes} passes before it stand in the log."
-            ) from error
+            raise broken_off(error, self.system, number, steps + 1) from error
         if status != episode.OK:
             self._workspace.roll_back()
-            raise refused(status, self.system, number, steps, (total, td_error, change))
+            raise refused(status, self.system, number, steps, (total, td_error, change), self.q_table.actions)
         # NumPy's floats, with which the plain episode computes, would warn where the sums of a detector overflow.
         signals = {
             "return": float(total), "steps": float(steps), "td_error": float(td_error), "q_change": float(change)
@@ -418,11 +417,19 @@ class Execute:
         block = self.uniforms.values[at : at + self._system_draws].copy()  # a system may keep what it is told
         told = Episode(number, int(sequence.generate_state(1)[0]), block)
         try:
-            self._called.state, available = self.system.begin(told)
+            state, available = self.system.begin(told)
+        except ManagedSystemError as error:
+            raise self._failed_to_reset(error, number) from error
         except MapekError:
             raise
         except faults() as error:
             raise self._failed_to_reset(error, number) from error
+        if (first := whole(state)) is None:
+            raise ManagedSystemError(
+                f"{self.system.name} began episode {number} in state {shown(state)}; a state is an int from 0 to "
+                f"{self.system.n_states - 1}"
+            )
+        self._called.state = first
         if number == self._look_at:
             self._look(number)
         # One object as long as nothing changes: what compares by identity is cheap downstream.
@@ -439,9 +446,11 @@ class Execute:
         self._held = number, now
 
     def _failed_to_reset(self, error: BaseException, number: int) -> ManagedSystemError:
+        what = f"{self.system.name} raised {told(error)}"
+        if isinstance(error, ManagedSystemError):
+            what = str(error).rstrip(".")
         return ManagedSystemError(
-            f"{self.system.name} raised {told(error)}, at the reset of episode {number}. The "
-            f"{self.passes} passes before it stand in the log."
+            f"{what}, at the reset of episode {number}. The {self.passes} passes before it stand in the log."
         )
 
     def _take_actions(self, available: tuple[int, ...], number: int) -> None:

@@ -1,8 +1,9 @@
 """One episode of tabular TD learning, written once.
 
-`episode` is a template: the names `begin`, `act`, `explorable`, `value` and `step_size` are bound to a system's and a
-learner's rules by `mape.compose`. Bound to compilable rules it becomes one compiled call; bound to the same rules as
-plain Python, or to the methods of any Gymnasium environment, it is the same algorithm with the same bits.
+`episode` is a template: the names `begin`, `narrow`, `act`, `credit`, `explorable`, `value` and `step_size` are bound
+to a system's and a learner's rules by `mape.compose`. Bound to compilable rules it becomes one compiled call; bound to
+the same rules as plain Python, or to the methods of any Gymnasium environment, it is the same algorithm with the same
+bits.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from mape.execute.rules import Floats, Ints, greedy
 
 # Bound by `mape.compose`.
 begin: Any = None
+narrow: Any = None
 act: Any = None
+credit: Any = None
 explorable: Any = None
 value: Any = None
 step_size: Any = None
 
-OK, NON_FINITE, OFF_TABLE, OVERFLOW = 0, 1, 2, 3
+OK, NON_FINITE, OFF_TABLE, OVERFLOW, NONE_LEGAL = 0, 1, 2, 3, 4
 TRACE_COLUMNS = ("state", "action", "exploratory", "q", "td_error", "alpha")
 
 
@@ -35,6 +38,7 @@ def episode(
     saved: Floats,
     used: Ints,
     rows: Ints,
+    legal: Ints,
     choices: Ints,
     actions: Ints,
     rate: Floats,
@@ -66,8 +70,9 @@ def episode(
     journal, saved, used
         The undo journal: flat index and old value of each touched pair; ``used[0]`` is its length, ``used[1]`` the
         number of steps, -1 before the first state. They are valid even if a rule raises.
-    rows, choices
-        The rows that may be used, and as much working space.
+    rows, legal, choices
+        The rows of the actions on offer; those of them that are legal in a state, written here; as much working space.
+        Where all that is offered is legal in every state, `legal` is `rows`.
     actions
         Action id of each row.
     rate
@@ -91,7 +96,6 @@ def episode(
     for k in range(len(context)):
         context[k] = 0.0
     n_states = q.shape[1]
-    count = len(rows)
     at_step = at + reset_draws
     at_choice = at_step + max_steps * step_draws
     tracing = len(trace) > 0
@@ -101,6 +105,9 @@ def episode(
     used[1] = 0
     if not 0 <= state < n_states:
         return OFF_TABLE, 0, float(state), -1.0, 0.0
+    count = narrow(system, phase, state, rows, legal, actions)  # what is legal in the present state: legal[:count]
+    if count == 0:
+        return NONE_LEGAL, 0, float(state), -1.0, 0.0
     steps = 0
     ended = False
     best = -1  # the greedy row of the present state, where it is known
@@ -109,23 +116,24 @@ def episode(
         exploring = draws[at_choice] < epsilon
         if exploring or mask_greedy:
             for i in range(count):
-                if explorable(system, phase, state, actions[rows[i]]):
-                    choices[allowed] = rows[i]
+                if explorable(system, phase, state, actions[legal[i]]):
+                    choices[allowed] = legal[i]
                     allowed += 1
         if exploring:
             if allowed:
                 row = choices[int(draws[at_choice + 1] * allowed)]
             else:
-                row = rows[int(draws[at_choice + 1] * count)]
+                row = legal[int(draws[at_choice + 1] * count)]
         elif best >= 0:
             row = best
         elif mask_greedy and allowed:
             row = greedy(q, choices, allowed, state)
         else:
-            row = greedy(q, rows, count, state)
+            row = greedy(q, legal, count, state)
         at_choice += 2
 
         next_state, reward, terminated, ended = act(system, phase, state, actions[row], draws, at_step, context)
+        row = credit(system, row, actions)
         at_step += step_draws
         steps += 1
         used[1] = steps
@@ -136,23 +144,27 @@ def episode(
         bootstrap = 0.0
         best = -1
         if bootstrap_terminal or not terminated:
+            count = narrow(system, phase, next_state, rows, legal, actions)
+            if count == 0 and not terminated:
+                return NONE_LEGAL, steps, float(next_state), float(actions[row]), 0.0
             allowed = 0
             if mask_greedy or on_policy:
                 for i in range(count):
-                    if explorable(system, phase, next_state, actions[rows[i]]):
-                        choices[allowed] = rows[i]
+                    if explorable(system, phase, next_state, actions[legal[i]]):
+                        choices[allowed] = legal[i]
                         allowed += 1
-            if mask_greedy and allowed:
-                best = greedy(q, choices, allowed, next_state)
-            else:
-                best = greedy(q, rows, count, next_state)
             # What exploration may choose there, of which an expectation is taken, is not what the greedy choice may.
-            if allowed:
-                bootstrap = value(q, choices, allowed, next_state, best, epsilon)
-            else:
-                bootstrap = value(q, rows, count, next_state, best, epsilon)
-            if next_state == state:
-                best = -1  # the update below changes this very state
+            if count > 0:  # else the end, where nothing can be done any more
+                if mask_greedy and allowed:
+                    best = greedy(q, choices, allowed, next_state)
+                else:
+                    best = greedy(q, legal, count, next_state)
+                if allowed:
+                    bootstrap = value(q, choices, allowed, next_state, best, epsilon)
+                else:
+                    bootstrap = value(q, legal, count, next_state, best, epsilon)
+                if next_state == state:
+                    best = -1  # the update below changes this very state
         old = q[row, state]
         td_error = reward + discount * bootstrap - old
         if not math.isfinite(td_error):

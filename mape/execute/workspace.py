@@ -17,13 +17,16 @@ class Workspace:
     ----------
     longest
         Steps of the longest episode, which touches as many pairs of state and action at most.
+    narrowed
+        Whether there may be states in which not all that is offered is legal.
 
     Attributes
     ----------
     used : int64 array, shape (2,): length of the journal, and steps of the episode; valid even if a rule raised.
     """
 
-    def __init__(self, longest: int) -> None:
+    def __init__(self, longest: int, narrowed: bool) -> None:
+        self._narrowed = narrowed
         self._journal = np.empty(longest, dtype=np.int64)
         self._saved = np.empty(longest)
         self.used: Ints = np.zeros(2, dtype=np.int64)
@@ -41,6 +44,7 @@ class Workspace:
         usable = [row for row, action in enumerate(self._table.actions) if action in available]
         if usable:
             self._rows = np.array(usable, dtype=np.int64)
+            self._legal = np.empty_like(self._rows) if self._narrowed else self._rows
             self._choices = np.empty_like(self._rows)
         return bool(usable)
 
@@ -48,7 +52,17 @@ class Workspace:
     def arguments(self) -> tuple[Any, ...]:
         """The table and the arrays, in the order of `episode.episode`."""
         values = self._table.values
-        return values, self._touched, self._journal, self._saved, self.used, self._rows, self._choices, self._actions
+        return (
+            values,
+            self._touched,
+            self._journal,
+            self._saved,
+            self.used,
+            self._rows,
+            self._legal,
+            self._choices,
+            self._actions,
+        )
 
     def forget(self) -> None:
         """Let what the last episode wrote stand: an episode that is broken off before it begins has written nothing."""

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import isfinite
+from typing import Any
+
+import numpy as np
 
 from knowledge import Observation, Reading, Symptom
 from knowledge.rows import DIRECTIONS
 from mape.errors import PartError
 from mape.ports import Detector, Json
 from mape.states import faults, hand_over, restore, state_of, told
+from mape.values import number, shown
 
 _new = tuple.__new__  # half the cost of a named tuple's own constructor, on the hot path
 
@@ -50,9 +54,13 @@ class Monitor:
                     detector.reset()
                 value = signals[name]
                 alarm, statistic = detector.update(value), detector.statistic
-                if statistic is not None and not isfinite(statistic):
-                    raise ValueError(f"its statistic is {statistic!r}, not a finite number or None")
-                reading = _new(Reading, (name, value, statistic, alarm, detector.direction))
+                if type(alarm) is not bool:
+                    alarm = _alarm(alarm)
+                if statistic is not None and (type(statistic) is not float or not isfinite(statistic)):
+                    statistic = _statistic(statistic)
+                if (direction := detector.direction) not in DIRECTIONS:
+                    raise ValueError(f"its direction is {direction!r}, none of {', '.join(DIRECTIONS)}")
+                reading = _new(Reading, (name, value, statistic, alarm, direction))
                 if alarm:
                     detector.reset()
             except faults() as error:
@@ -119,3 +127,30 @@ class Monitor:
             f"{seen.signals.get(name)}. Records up to that observation are kept; choose another detector, "
             "or mend this one and run `mapek check` on it."
         )
+
+
+def _alarm(given: Any) -> bool:
+    """Return NumPy's truth values as Python's.
+
+    Raises
+    ------
+    TypeError
+        It is something else, such as None or a statistic.
+    """
+    if isinstance(given, np.bool_):
+        return bool(given)
+    raise TypeError(f"its update returned {shown(given)}, where an alarm is True or False")
+
+
+def _statistic(given: Any) -> float:
+    """Return a finite number as a float.
+
+    Raises
+    ------
+    ValueError
+        It is none.
+    """
+    statistic = number(given)
+    if statistic is None or not isfinite(statistic):
+        raise ValueError(f"its statistic is {shown(given)}, not a finite number or None")
+    return statistic

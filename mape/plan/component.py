@@ -153,12 +153,14 @@ class Plan:
             if not (isinstance(rate, tuple) and len(rate) == rates and all(map(_is_number, rate))):
                 raise self._refused("the learning rate", rate, number, f"the learner takes {rates} numbers, in a tuple")
             self._rate = rate
-        if not (isinstance(epsilon, (float, int)) and 0.0 <= epsilon <= 1.0):
+        if not (_is_number(epsilon) and 0.0 <= epsilon <= 1.0):
             raise self._refused("epsilon", epsilon, number, "an exploration rate is a number in [0, 1]")
         if not (add is drop is enable is _NO_ACTIONS):  # as in all passes but a few
             for name, actions in (("add", add), ("drop", drop), ("enable", enable)):
-                if not (isinstance(actions, tuple) and all(type(action) is int for action in actions)):
-                    raise self._refused(name, actions, number, "it is a tuple of action ids, each an int")
+                if not (isinstance(actions, tuple) and all(type(a) is int and a >= 0 for a in actions)):
+                    raise self._refused(name, actions, number, "it is a tuple of action ids, each an int from 0")
+                if len(set(actions)) != len(actions):
+                    raise self._refused(name, actions, number, "it names each action once")
         if type(reset) is not bool:
             raise self._refused("reset_detector", reset, number, "it is True or False")
         if adopt is not None and not isinstance(adopt, str):

@@ -52,6 +52,7 @@ def passes(
     saved: Floats,
     used: Ints,
     rows: Ints,
+    legal: Ints,
     choices: Ints,
     actions: Ints,
     rate: Floats,
@@ -100,8 +101,9 @@ def passes(
         for k in range(len(state)):
             before[k] = state[k]
         status, steps, total, td_error, change = drive(
-            first + i, epsilon, at, trace, system, q, touched, journal, saved, used, rows, choices, actions, rate,
-            draws, context, discount, bootstrap_terminal, on_policy, mask_greedy, reset_draws, step_draws, max_steps,
+            first + i, epsilon, at, trace, system, q, touched, journal, saved, used, rows, legal, choices, actions,
+            rate, draws, context, discount, bootstrap_terminal, on_policy, mask_greedy, reset_draws, step_draws,
+            max_steps,
         )  # fmt: skip
         if status != OK:
             return

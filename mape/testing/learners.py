@@ -90,8 +90,8 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
             given = {plain(q, rows[first:], len(rows) - first, state, best, epsilon) for first in range(len(rows))}
             if len(given) > 1:
                 raise Broken(
-                    f"on_policy is False, and value gives {sorted(given)} for one state and greedy row over other rows: "
-                    "it looks at them. Say on_policy = True, so that they are those which exploration chooses from"
+                    f"on_policy is False, and value gives {sorted(given)} for one state and greedy row over other "
+                    "rows: it looks at them. Say on_policy = True, which makes them those that exploration chooses from"
                 )
 
     def same_bits() -> None:

@@ -38,6 +38,8 @@ class _Moment(NamedTuple):
     reward: float
     ended: bool
     explorable: tuple[bool, ...]
+    legal: tuple[bool, ...]
+    taken: int | None
     signals: tuple[float, ...]
 
 
@@ -87,6 +89,18 @@ def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) ->
         system = fresh()
         for number in range(1, episodes + 1):
             _play(system, number)
+
+    def soft() -> None:
+        system = fresh()
+        for number in range(1, EPISODES + 1):
+            for moment in _play(system, number):
+                if any(legal and not worth for legal, worth in zip(moment.legal, moment.explorable, strict=True)):
+                    raise Noted(
+                        f"its mask is soft: in state {moment.state} it bars actions that are legal. It keeps "
+                        "exploration from them while there are others, and with execute.mask_greedy the greedy choice "
+                        "too; it is no protection. An action that must never be taken is left out of "
+                        "info['legal_actions'], or of the rules' legal"
+                    )
 
     def foretells() -> None:
         system = fresh()
@@ -161,6 +175,7 @@ def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) ->
         [
             ("describes itself in numbers", lambda: describe(fresh())),
             ("stays within its states, with finite rewards and known actions", plays),
+            ("bars by its mask only what may be taken nevertheless", soft),
             ("says beforehand which actions an episode offers, or nothing", foretells),
             ("is deterministic: two fresh ones play the same episodes", deterministic),
             ("plays an episode the same whatever was played before", redriven),
@@ -201,11 +216,14 @@ def _play(system: ManagedSystem, number: int, held: dict[str, str] | None = None
     if not available or len({*available}) != len(available) or any(type(a) is not int or a < 0 for a in available):
         raise Broken(f"episode {number} offers {available!r}; give at least one action, distinct ints from 0")
     _in_range(system, state, f"begin() of episode {number}")
-    moments = [_Moment(-1, state, 0.0, False, tuple(bool(system.explorable(a)) for a in available), ())]
+    told: Any = system  # what it need not have
+    marks = tuple(bool(system.explorable(a)) for a in available)
+    legal = _legal(told, available, f"begin() of episode {number}")
+    moments = [_Moment(-1, state, 0.0, False, marks, tuple(a in legal for a in available), None, ())]
     rng = random.Random(number)
     context = np.zeros(len(system.signal_names))
     for step in range(1, min(system.max_steps, LONGEST) + 1):
-        action = rng.choice(available)
+        action = rng.choice(legal)
         context[:] = 0.0
         state, reward, terminated, truncated = system.step(action, context)
         where = f"step({action}) in episode {number}"
@@ -217,11 +235,25 @@ def _play(system: ManagedSystem, number: int, held: dict[str, str] | None = None
         if not np.isfinite(context).all():
             raise Broken(f"{where} gave signals {dict(zip(system.signal_names, context.tolist(), strict=True))}")
         ended = terminated or truncated or step == system.max_steps
+        taken = getattr(told, "taken", None)
+        if taken is not None and type(taken) is not int:
+            raise Broken(f"{where} gave taken {taken!r}; give the id of the action that was taken, an int, or None")
         marks = () if ended else tuple(bool(system.explorable(a)) for a in available)
-        moments.append(_Moment(action, state, float(reward), ended, marks, tuple(context.tolist())))
+        legal = [] if terminated else _legal(told, available, where)
+        whole = () if ended else tuple(a in legal for a in available)
+        moments.append(_Moment(action, state, float(reward), ended, marks, whole, taken, tuple(context.tolist())))
         if ended:
             break
     return moments
+
+
+def _legal(system: Any, available: tuple[int, ...], where: str) -> list[int]:
+    """Return which of the actions on offer may be taken in the present state of a system."""
+    legal = getattr(system, "legal_actions", None)
+    found = [action for action in available if legal is None or action in legal]
+    if not found:
+        raise Broken(f"{where} led to a state in which of {available} none is legal: {legal}; let one at least be")
+    return found
 
 
 def _in_range(system: ManagedSystem, state: Any, where: str) -> None:
@@ -238,19 +270,25 @@ def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
     phase = rules.phase(rules.params, number)
     state = rules.reset(rules.params, phase, draws, 0)
 
+    may = getattr(rules, "legal", None)
+
     def marks() -> tuple[bool, ...]:
         return tuple(bool(rules.explorable(rules.params, phase, state, action)) for action in available)
 
-    moments = [_Moment(-1, state, 0.0, False, marks(), ())]
+    def legal() -> tuple[bool, ...]:
+        return tuple(may is None or bool(may(rules.params, phase, state, action)) for action in available)
+
+    moments = [_Moment(-1, state, 0.0, False, marks(), legal(), None, ())]
     rng = random.Random(number)
     context = np.zeros(len(system.signal_names))
     for step in range(min(system.max_steps, LONGEST)):
-        action = rng.choice(available)
+        action = rng.choice([action for action, whether in zip(available, legal(), strict=True) if whether])
         context[:] = 0.0
         at = rules.reset_draws + step * rules.step_draws
         state, reward, terminated = rules.step(rules.params, phase, state, action, draws, at, context)
         ended = bool(terminated) or step + 1 == system.max_steps
-        moments.append(_Moment(action, state, float(reward), ended, () if ended else marks(), tuple(context.tolist())))
+        after = ((), ()) if ended else (marks(), legal())
+        moments.append(_Moment(action, state, float(reward), ended, *after, None, tuple(context.tolist())))
         if ended:
             break
     return moments

@@ -136,6 +136,104 @@ class NoSpace(Fine):
         self.observation_space, self.action_space = Discrete(3), None
 
 
+class HalfState(Fine):
+    def react(self):
+        return 1.5, 1.0
+
+
+class TextReward(Fine):
+    def react(self):
+        return 1, "1.0"
+
+
+class VectorReward(Fine):
+    def react(self):
+        return 1, [1.0]
+
+
+class NoReward(Fine):
+    def react(self):
+        return 1, None
+
+
+class ComplexReward(Fine):
+    def react(self):
+        return 1, 1 + 2j
+
+
+class TextEnd(Fine):
+    def step(self, action):
+        seen, reward, _, truncated, info = super().step(action)
+        return seen, reward, "False", truncated, info
+
+
+class TextMask(Fine):
+    def info(self):
+        return {"action_mask": ["1", "0"]}
+
+
+class ZeroMask(Fine):
+    def info(self):
+        return {"action_mask": [0, 0]}
+
+
+class NoneLegal(Fine):
+    def info(self):
+        return {"legal_actions": ()}
+
+
+class HalfAction(Fine):
+    def info(self):
+        return {"available_actions": (0, 1.5)}
+
+
+class TextSignal(Fine):
+    signal_names = ("load",)
+
+    def info(self):
+        return {"signals": {"load": "3"}}
+
+
+class NoInfo(Fine):
+    def info(self):
+        return None
+
+
+class StrangeGuard(Fine):
+    def info(self):
+        return {"action_taken": 7} if self.steps else {}
+
+
+class OldReset(Fine):
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed, options=options)[0]
+
+
+class StrictReset(Fine):
+    def reset(self, *, seed=None, options=None):
+        if options:
+            raise ValueError(f"unknown options {list(options)}")
+        return super().reset(seed=seed, options={"episode": 1})
+
+
+class Bare(Fine):
+    def reset(self, *, seed=None):
+        return super().reset(seed=seed, options={"episode": 1})
+
+
+class Bound(Bare):
+    def reset(self):
+        return super().reset()
+
+
+class OneName(Fine):
+    signal_names = "load"
+
+
+class SaysNo(Fine):
+    redrivable = "no"
+
+
 for name, kind in list(globals().items()):
     if isinstance(kind, type) and issubclass(kind, Fine) and f"{name}-v0" not in gymnasium.registry:
         gymnasium.register(f"{name}-v0", kind, max_episode_steps=20)

@@ -70,7 +70,8 @@ def files(name: str, config: str, *says: str) -> Case:
 
 
 def world(name: str, code: int, *says: str, kind: str = "") -> Case:
-    kind = kind or "".join(word.capitalize() for word in name.split())
+    told = says[0].removesuffix("-v0")
+    kind = kind or (told if told != says[0] else "".join(word.capitalize() for word in name.split()))
     return sets(f"a system with {name}", code, (f'system={{id="bad_worlds:{kind}-v0"}}',), *says)
 
 
@@ -224,7 +225,9 @@ CASES = [
         "a detector that raises", 1, "RaisingDetector", "RaisingDetector", "ZeroDivisionError", "no variance", "pass 1"
     ),
     detector("a detector with a statistic of NaN", 1, "NanDetector", "NanDetector", "nan", "pass 1"),
-    detector("a detector with text as statistic", 1, "TextDetector", "TextDetector", "not str", "pass 1"),
+    detector(
+        "a detector with text as statistic", 1, "TextDetector", "TextDetector", "'high'", "finite number", "pass 1"
+    ),
     detector("a detector of a side that is none", 1, "SidewaysDetector", "SidewaysDetector", "'sideways'"),
     planner("a planner with epsilon 2", 1, "EpsilonTwo", "EpsilonTwo", "2.0", "[0, 1]", "pass 2"),
     planner("a planner with epsilon NaN", 1, "EpsilonNan", "EpsilonNan", "nan", "[0, 1]", "pass 2"),
@@ -475,13 +478,49 @@ CASES = [
     world("infinite reward", 1, "InfiniteReward-v0", "reward -inf", "episode 3"),
     world("huge reward", 1, "episode 1 at step 3", "1.7e+308", "diverge", "Lower discount"),
     world("no actions", 1, "NoActions-v0", "no action", "at least one"),
-    world("negative action", 1, "NegativeAction-v0", "action -1", "0 to 63"),
+    world("negative action", 1, "NegativeAction-v0", "action -1", "0 to 63", "begin at 0"),
     world("large action", 1, "LargeAction-v0", "action 64", "system.max_actions"),
     world("double action", 1, "DoubleAction-v0", "(0, 0, 1)"),
     world("other actions", 1, "OtherActions-v0", "(5, 6)", "(0, 1)", "at least one known action"),
     world("vanishing actions", 1, "VanishingActions-v0", "no action", "episode 3"),
-    world("a state outside its space", 1, "OffTheMap-v0", "state 7", "0 .. 2", "episode 3 at step 2", kind="OffTheMap"),
-    world("text state", 1, "TextState-v0", "episode 1 at step 1", "'left'"),
+    world("a state outside its space", 1, "OffTheMap-v0", "7", "Discrete(3)", "episode 3 at step 2", kind="OffTheMap"),
+    world("text state", 1, "TextState-v0", "episode 1 at step 1", "'left'", "Discrete(3)"),
+    world("a state between two", 1, "HalfState-v0", "1.5", "Discrete(3)", "episode 1 at step 1"),
+    world("text reward", 1, "TextReward-v0", "reward '1.0'", "one real number", "episode 1 at step 1"),
+    world("vector reward", 1, "VectorReward-v0", "reward [1.0]", "one real number", "episode 1 at step 1"),
+    world("no reward", 1, "NoReward-v0", "reward None", "one real number", "episode 1 at step 1"),
+    world("complex reward", 1, "ComplexReward-v0", "reward (1+2j)", "one real number", "episode 1 at step 1"),
+    world("an end that is text", 1, "TextEnd-v0", "terminated = 'False'", "True or False", "episode 1 at step 1"),
+    world("a mask of text", 1, "TextMask-v0", "info['action_mask']", "0 or 1", "episode 1"),
+    world("a mask of zeros", 1, "ZeroMask-v0", "info['action_mask'] of [0, 0]", "info['legal_actions']", "episode 1"),
+    world("no legal action", 1, "NoneLegal-v0", "info['legal_actions'] = ()", "one action at least", "episode 1"),
+    world("an action between two", 1, "HalfAction-v0", "info['available_actions'] = (0, 1.5)", "0 .. 1", "episode 1"),
+    world("text signal", 1, "TextSignal-v0", "signal 'load' = '3'", "real number", "episode 1 at step 1"),
+    world("info that is none", 1, "NoInfo-v0", "info", "a dict", "episode 1"),
+    world("an unknown action taken", 1, "StrangeGuard-v0", "info['action_taken'] = 7", "0 .. 1", "episode 1 at step 1"),
+    world("a reset of the old kind", 1, "OldReset-v0", "from reset()", "(observation, info)", "episode 1", "0.26"),
+    world("a strict reset", 1, "StrictReset-v0", "'episode'", "system.reset_takes = ['seed']", "episode 1"),
+    sets(
+        "a reset without options", 2, 'system={id="bad_worlds:Bare-v0"}', "no options", "system.reset_takes = ['seed']"
+    ),
+    sets(
+        "more steps than there are",
+        2,
+        'system={id="bad_worlds:Fine-v0", max_steps=200}',
+        "system.max_steps = 200",
+        "after 20 steps",
+        "max_episode_steps",
+    ),
+    sets("a backlog in lockstep", 2, "execute.backlog=7", "backlog = 7", "mode = 'free'"),
+    sets("signal names in one text", 2, 'system={id="bad_worlds:OneName-v0"}', "signal_names = 'load'", "('load',)"),
+    sets("a redrivable of text", 2, 'system={id="bad_worlds:SaysNo-v0"}', "redrivable = 'no'", "True or False"),
+    sets(
+        "bins too far apart",
+        2,
+        'system={id="CartPole-v1", discretise={low=[-1.7e308], high=[1.7e308], bins=[3]}}',
+        "-1.7e+308",
+        "too far apart",
+    ),
     world(
         "an exception in reset",
         1,
@@ -502,7 +541,7 @@ CASES = [
     ),
     world("missing signal", 1, "MissingSignal-v0", "'load'", "info['signals']"),
     world("nan signal", 1, "NanSignal-v0", "load = nan", "finite"),
-    world("a step of four values", 1, "Fourfold-v0", "episode 1", kind="Fourfold"),
+    world("a step of four values", 1, "Fourfold-v0", "episode 1", "terminated, truncated", "0.26", kind="Fourfold"),
     sets(
         "a system with an observation of NaN",
         1,

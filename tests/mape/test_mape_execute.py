@@ -171,9 +171,8 @@ def test_a_system_without_any_action_is_refused(when):
 @pytest.mark.parametrize("when", [1, 4])
 def test_an_action_id_that_no_record_holds_is_refused_with_the_way_out(bad, when):
     system = Corridor(offers=lambda episode: (0, bad) if episode == when else (0, 1))
-    with pytest.raises(
-        ManagedSystemError, match=f"offers action {bad} in episode {when}; .* from 0 to 7. Raise system.max"
-    ):
+    way_out = "Raise system.max_actions" if bad > 0 else "Let its action space begin at 0"
+    with pytest.raises(ManagedSystemError, match=f"offers action {bad} in episode {when}; .* from 0 to 7. {way_out}"):
         after(5, system, system={"max_actions": 8})
 
 
