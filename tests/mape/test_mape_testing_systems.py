@@ -213,7 +213,7 @@ def test_an_environment_that_carries_nothing_or_says_it_is_found_to_do_so(name):
     grid = BoxGrid(low=(-1.0,) * 4, high=(1.0,) * 4, bins=(2,) * 4) if name == "CartPole-v1" else None
     config = SystemConfig(
         id=name if "-v" in name else f"{name}-v0",
-        max_steps=50,
+        max_steps=50 if "-v" in name else None,  # the others end earlier by themselves
         discretise=grid,
     )
     assert held(check_system(lambda: make_system(config), 3)) == (WHATEVER, "ok", "")
