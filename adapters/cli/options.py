@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
@@ -27,8 +26,6 @@ exit codes: 0 done, 1 failure, 2 usage, 130 stopped by Ctrl-C (finished trials a
 
 _CONFIG = "TOML file, an example by its name (`mapek examples`), or the config-*.json of an earlier run"
 
-_OPTION = re.compile("--[a-zA-Z][a-zA-Z0-9-]*")
-
 
 class _Parser(argparse.ArgumentParser):
     """A command, which says of a word that it does not know which one may have been meant."""
@@ -45,7 +42,9 @@ class _Parser(argparse.ArgumentParser):
         # Here, for else argparse first finds what a misspelt option has left missing.
         for word in itertools.takewhile(self._is_mine, args):
             option = word.partition("=")[0]
-            if _OPTION.fullmatch(option) and not any(known.startswith(option) for known in self._option_string_actions):
+            # With a blank in it, it is a value to argparse.
+            long = option.startswith("--") and option != "--" and " " not in word
+            if long and not any(known.startswith(option) for known in self._option_string_actions):
                 told = (name for name, a in self._option_string_actions.items() if a.help is not argparse.SUPPRESS)
                 self._unknown("option", option, (name for name in told if name.startswith("--")))
         return super().parse_known_args(args, namespace)
