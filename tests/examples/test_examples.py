@@ -111,6 +111,27 @@ def test_a_toy_text_is_learned_with_the_seed_of_its_config(name, here):
     assert returns[-100:].mean() > returns[:100].mean()
 
 
+def test_the_readme_shows_the_config_of_the_machine_and_its_signal_mask_and_drift_are_seen(here):
+    assert f"```toml\n{(ROOT / 'examples' / 'machine.toml').read_text(encoding='utf-8')}```" in README
+    (line,) = re.findall(r"`(mapek run machine [^`]*)`", README)
+    said = _typed(f"{line} -q --no-figures --out results/machine", here)
+    assert re.findall(r"^--- pass (\d+)", said, flags=re.MULTILINE) == ["308", "309", "310"]
+    assert len(re.findall(r"^Execute .*; vibration [3-4]\.\d+\.$", said, flags=re.MULTILINE)) == 3
+    assert re.findall(r"^alarms: +(.*) \(episodes\)$", said, flags=re.MULTILINE) == ["309"]
+    assert re.findall(r"^Analyze +(vibration drifted up)\.", said, flags=re.MULTILINE) == ["vibration drifted up"]
+    assert "all kept" in _typed("mapek check machine", here)
+
+    config = load("machine")
+    assert config.learner == load("frozen_lake").learner
+    assert make_system(config.system).drifts == (301,)
+    masked, free = (
+        run_trial(load("machine", overrides=[f"execute.mask_greedy={on}"]), 0, make_system) for on in ("true", "false")
+    )
+    assert masked.log_sha256 != free.log_sha256
+    answering = load("machine", overrides=['plan.respond_to=["added"]'])
+    assert run_trial(answering, 0, make_system).log_sha256 != masked.log_sha256
+
+
 def _commands():
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
     lines = [line for language, block in blocks if not language for line in block.splitlines()]
@@ -275,7 +296,7 @@ def test_the_readmes_keys_are_made(here):
 
 def test_the_example_of_swaps_makes_three_and_the_readme_shows_its_first(here):
     text = (ROOT / "examples" / "swaps.toml").read_text(encoding="utf-8")
-    (shown,) = re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL)
+    (shown,) = (block for block in re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL) if "[[swap]]" in block)
     assert shown.splitlines()[1:] == text.split("[[swap]]")[1].strip().splitlines()[1:]
 
     said = _typed("mapek run swaps -q --no-figures --out results/swaps", here)
