@@ -96,6 +96,9 @@ class SystemConfig(PartConfig):
     redrivable: bool | None = Field(
         None, description="whether an episode can be driven again after others; by default as the system says, or true"
     )
+    retries: int = Field(
+        0, ge=0, le=1_000_000, description="how often an episode that the system broke off is begun again"
+    )
 
     reset_takes: tuple[Literal["seed", "options"], ...] = Field(
         ("seed", "options"),

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import functools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from knowledge import ChangePlan, ChangeRequest, Knowledge, Log, Observation, QTable, Record, RowLayout, Symptom
+from knowledge import STAGES, ChangePlan, ChangeRequest, Knowledge, Log, Observation, QTable, Record, RowLayout, Symptom
 from mape.analyze import Analyze
 from mape.bus import LocalBus
 from mape.config import Config, SwapConfig
@@ -89,6 +89,7 @@ def build_execute(
         engine=config.execute.engine,
         mask_greedy=config.execute.mask_greedy,
         max_actions=config.system.max_actions,
+        retries=config.system.retries,
         checkpoint=checkpoint,
     )
 
@@ -104,6 +105,10 @@ class Loop:
         The managed system, fresh.
     trial, loop
         Which stream of randomness is used; the number of this unit of work (`Config.unit`) stands in the records.
+    checkpoint
+        Execute's, after some episodes; `go_on` then makes the passes up to there again.
+    keep
+        Called with each record before any component is.
 
     Raises
     ------
@@ -121,7 +126,16 @@ class Loop:
     3
     """
 
-    def __init__(self, config: Config, system: ManagedSystem, trial: int = 0, loop: int = 0) -> None:
+    def __init__(
+        self,
+        config: Config,
+        system: ManagedSystem,
+        trial: int = 0,
+        loop: int = 0,
+        *,
+        checkpoint: tuple[Json, QTable] | None = None,
+        keep: Callable[[Record], object] | None = None,
+    ) -> None:
         if config.execute.mode == "free":
             raise ConfigError(
                 "free-running needs processes: mapek up. In one process each episode waits for its plan "
@@ -136,15 +150,44 @@ class Loop:
         self.monitor = build_monitor(config, send)
         self.analyze = build_analyze(config, send)
         self.plan = build_plan(config, self.knowledge, send)
-        self.execute = build_execute(config, system, self.knowledge, send, trial, loop)
+        self.execute = build_execute(config, system, self.knowledge, send, trial, loop, checkpoint)
+        if keep is not None:
+            for kind in STAGES:
+                self.bus.subscribe(kind, keep)
         self.bus.subscribe(Observation, self.monitor.on_observation)
         self.bus.subscribe(Symptom, self.analyze.on_symptom)
         self.bus.subscribe(ChangeRequest, self.plan.on_request)
-        self.bus.subscribe(ChangePlan, self.execute.adopt)
-        self._own_subscriptions = self.bus.subscriptions
+        if checkpoint is None:
+            self.bus.subscribe(ChangePlan, self.execute.adopt)
+        self._own_subscriptions = len(STAGES)  # of the components; who keeps records wants to hear of each
         self._stretches: Stretches | None = None
         self._swaps = deque(config.swap)  # those that are still to be made
         self._told: list[Callable[[SwapConfig, bool], object]] = []
+
+    def go_on(self, past: Iterable[Observation], read: Callable[[int], QTable]) -> None:
+        """Make the passes of these Observations again, without their episodes, and be where they end.
+
+        Execute, made of the checkpoint of the last of them, gets the plan that answers it.
+
+        Parameters
+        ----------
+        past
+            From that of pass 1 on, in order.
+        read
+            Gives the Q-table at the end of an episode, where a planner had asked for it.
+        """
+        number = 0
+        self.knowledge.serve_q_table(lambda: read(number))
+        self.plan.start(self.log.loop)
+        for seen in past:
+            self.bus.run()
+            number = seen.pass_no
+            self._swap_before(number)
+            self.knowledge.actions = seen.known
+            self.bus.send(seen)
+        self.bus.subscribe(ChangePlan, self.execute.adopt)
+        self.bus.run()
+        self.knowledge.serve_q_table(lambda: self.execute.q_table.copy())
 
     def on_swap(self, listener: Callable[[SwapConfig, bool], object]) -> None:
         """Tell `listener` of each swap that is made, and whether the new part took over the old one's state."""

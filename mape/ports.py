@@ -207,6 +207,10 @@ class ManagedSystem(Protocol):
         """Go on from what `get_state` gave, here or elsewhere."""
         ...
 
+    def renew(self) -> None:
+        """Close, and be another object of the same system, as freshly made; asked for after it has failed."""
+        ...
+
     def close(self) -> None:
         """Release what the system holds."""
         ...

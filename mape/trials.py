@@ -23,7 +23,7 @@ class TrialResult(NamedTuple):
 
     `alarms` are the episodes at whose end a detector alarmed; `handed_over` says of each swap that was made whether
     the new part took over the state of the old one. `dropped` is the number of passes of a free-running loop of which
-    there is no record.
+    there is no record. `aborted` are the attempts at episodes that the system broke off, each as the episode and why.
     """
 
     trial: int
@@ -35,6 +35,7 @@ class TrialResult(NamedTuple):
     loop: int = 0
     handed_over: tuple[bool, ...] = ()
     dropped: int = 0
+    aborted: tuple[tuple[int, str], ...] = ()
 
 
 def run_trial(
@@ -79,6 +80,8 @@ def run_trial(
             steps += more
             alarms.extend(alarmed)
 
+        aborted: list[tuple[int, str]] = []
+        running.execute.attempts.on_abort = lambda number, why: aborted.append((number, why))
         running.log.on_rows(count)
         running.on_swap(lambda swap, kept: handed_over.append(kept))
         if on_rows is not None:
@@ -98,6 +101,7 @@ def run_trial(
             running.execute.q_table.sha256(),
             loop,
             tuple(handed_over),
+            aborted=tuple(aborted),
         )
         running.close()
         return result

@@ -22,6 +22,7 @@ from adapters.buses.messages import (
 from adapters.buses.presence import Presence
 from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, OF_CONFIG, SINCE_LIMIT
 from adapters.roles import ROLES, STAGE_OF
+from adapters.stores.begun import begins, begun, breaks_off, failures
 from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
 from knowledge import STAGES, Ack, MalformedRecord
@@ -191,14 +192,15 @@ class Answers:
         told = Layout(
             signals=layout.signals, detectors=layout.detectors, rates=layout.rates, max_actions=layout.max_actions
         )
-        begun = self._ledger.store.facts().get("begun", {})
+        store, units = self._ledger.store, range(self._ledger.units)
         joined = Joined(
             epoch=epoch,
             seal=self._seal,
             units=self._ledger.units,
             layout=told,
             last=tuple(self._ledger.last(loop) for loop in range(self._ledger.units)),
-            begun=tuple(begun.get(str(loop), 0) for loop in range(self._ledger.units)),
+            begun=tuple(begun(store, loop) for loop in units),
+            failed=tuple(failures(store, loop, self._ledger.last(loop)[0] + 1) for loop in units),
             snapshot_every=self.snapshot_every,
             swaps=tuple(
                 Swapped(loop=s.loop, pass_no=s.pass_no, part=s.part, to=s.spec)
@@ -273,12 +275,14 @@ class Answers:
         self._check_epoch(role, _attachment(query))
         if happened.kind not in TOLD_BY_ROLES:
             raise Refusal(f"a role tells of {', '.join(TOLD_BY_ROLES)}; not of {happened.kind!r}")
-        if happened.kind == "begun":  # one per episode: only the last of them counts
+        if happened.kind in ("begun", "aborted"):
             if role != "execute" or happened.loop is None or happened.pass_no is None:
                 raise Refusal("only Execute begins episodes, and names its loop and episode")
             loop = self._loop(happened.loop)
-            begun = {**self._ledger.store.facts().get("begun", {}), str(loop): happened.pass_no}
-            self._ledger.store.set_facts(begun=begun)
+            if happened.kind == "begun":
+                begins(self._ledger.store, loop, happened.pass_no)
+            else:
+                breaks_off(self._ledger, happened.text, loop, happened.pass_no)
             return Answer(query, b"ok")
         self._ledger.note(role, happened.kind, happened.text, happened.loop, happened.pass_no)
         return Answer(query, b"ok")

@@ -113,7 +113,8 @@ class Joined(Message):
     ----------
     seal : what Knowledge attaches to all that it publishes.
     last : per loop, the number of the last record of each stage; -1 where there is no plan 0.
-    begun : per loop, the last episode that was begun, of systems that cannot be driven again.
+    begun : per loop, the last episode that was begun and not broken off since, of systems that cannot be driven again.
+    failed : per loop, how many attempts at its next episode were broken off.
     snapshot_every : passes from one state that is kept to the next.
     """
 
@@ -124,6 +125,7 @@ class Joined(Message):
     last: tuple[tuple[int, int, int, int], ...]
     swaps: tuple[Swapped, ...]
     begun: tuple[int, ...] = ()
+    failed: tuple[int, ...] = ()
     snapshot_every: Annotated[int, Field(ge=1)] = 100
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
+from adapters.cli.run import aborted_as_json
 from adapters.experiments.decimals import number, resolution
 from adapters.experiments.pairing import Pairing, pairing
 from adapters.experiments.runner import run_agents
@@ -41,6 +42,9 @@ def execute(chosen: argparse.Namespace) -> int:
                 "total_return": summary(returns[agent])._asdict(),
                 "total_steps": summary(steps[agent])._asdict(),
                 "alarms": alarms[agent],
+                **(
+                    {"aborted": aborted} if (aborted := [e for r in results[agent] for e in aborted_as_json(r)]) else {}
+                ),
                 "log_sha256": combined_hash(r.log_sha256 for r in results[agent]),
                 "q_table_sha256": combined_hash(r.q_table_sha256 for r in results[agent]),
             }

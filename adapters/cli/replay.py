@@ -15,10 +15,10 @@ from adapters.cli.sentences import ids, sentence
 from adapters.replay.records import Difference, LogReplay, Moment, Replayed, as_json, log_of
 from adapters.replay.tables import replay_tables
 from adapters.results.files import read_json
-from adapters.results.folder import MENDED, MODULES, read_manifest
+from adapters.results.folder import LOGS_OF_AGENTS, MENDED, MODULES, read_manifest
 from adapters.results.own_code import other_versions
 from adapters.scratch import scratch
-from adapters.stores import Store
+from adapters.stores import LOG_NAME, Store
 from adapters.versions import versions
 from mape.errors import ConfigError
 from mape.trials import combined_hash
@@ -54,7 +54,11 @@ def _log(chosen: argparse.Namespace, path: Path, log: LogReplay) -> int:
     result = path.parent / "result.json"
     compared = difference is None and chosen.to is None and result.exists()
     if compared:
-        difference = _against_result(result, read_json(result), found, chosen.loop is None)
+        stored = read_json(result)
+        if path.name != LOG_NAME:  # that of one of several agents, of which less is said
+            agent = path.stem.removeprefix(LOGS_OF_AGENTS)
+            stored = {"log_sha256": _combined(found, "log_sha256"), **stored.get("agents", {}).get(agent, {})}
+        difference = _against_result(result, stored, found, chosen.loop is None)
     if chosen.json:
         _print_json(path, log, found, difference, compared)
     else:
@@ -65,7 +69,7 @@ def _log(chosen: argparse.Namespace, path: Path, log: LogReplay) -> int:
 def _against_result(path: Path, stored: Mapping[str, Any], found: list[Replayed], whole: bool) -> Difference | None:
     """Compare with what the run itself said that it came to."""
     trials = stored.get("trials", [])
-    for one in found:
+    for one in found if "trials" in stored else ():
         said = trials[one.loop] if one.loop < len(trials) else {}
         for name in ("log_sha256", "q_table_sha256"):
             here = getattr(one, name)

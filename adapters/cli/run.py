@@ -74,6 +74,7 @@ def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
                 "alarms": list(r.alarms),
                 "total_steps": r.total_steps,
                 **({"dropped": r.dropped} if config.execute.mode == "free" else {}),
+                **({"aborted": aborted_as_json(r)} if r.aborted else {}),
                 "log_sha256": r.log_sha256 or None,
                 "q_table_sha256": r.q_table_sha256,
             }
@@ -82,6 +83,23 @@ def as_json(config: Config, results: list[TrialResult]) -> dict[str, Any]:
         "log_sha256": None if config.execute.mode == "free" else combined_hash(r.log_sha256 for r in results),
         "q_table_sha256": combined_hash(r.q_table_sha256 for r in results),
     }
+
+
+def aborted_as_json(result: TrialResult) -> list[dict[str, Any]]:
+    """Return the attempts at episodes that the system broke off in one unit."""
+    return [{"episode": number, "why": why} for number, why in result.aborted]
+
+
+def say_aborted(chosen: argparse.Namespace, config: Config, results: list[TrialResult], of: str = "") -> None:
+    """Print which episodes were begun again, where any were."""
+    aborted = [(r, number, why) for r in results for number, why in r.aborted]
+    if not aborted:
+        return
+    attempts = "1 attempt at an episode was" if len(aborted) == 1 else f"{len(aborted):,} attempts at episodes were"
+    say(chosen, f"aborted:  {attempts} broken off by the system, and begun again{of}; the first:")
+    for r, number, why in aborted[:3]:
+        unit = f"{config.unit_name(r.trial, r.loop)}, " if config.units > 1 else ""
+        say(chosen, f"          {unit}episode {number}: {why}")
 
 
 def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], last: npt.NDArray[Any]) -> None:
@@ -95,6 +113,7 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
         say(chosen, f"dropped:  {dropped:,} episodes of which there is no record: what follows is of the others")
     for swap, handed_over in zip(config.swap, results[0].handed_over, strict=True):
         say(chosen, swap_sentence(swap, handed_over))
+    say_aborted(chosen, config, results)
     unit, units = ("trial", "trials") if config.loops == 1 else ("loop", "loops of all trials")
     of_all = f" (of all {units})" if config.units > 1 else ""
     if config.units == 1:

@@ -20,9 +20,10 @@ from adapters.processes.serve import (
     serve_role,
     terminated_by_signal,
 )
+from adapters.processes.supervise import SYSTEM_FAILED
 from adapters.stores import LOG_NAME
 from mape.config import Config
-from mape.errors import ConfigError
+from mape.errors import ConfigError, ManagedSystemError
 
 
 def execute(chosen: argparse.Namespace) -> int:
@@ -36,6 +37,11 @@ def execute(chosen: argparse.Namespace) -> int:
             return _serve(chosen, released)
     except Terminated:
         return 143
+    except ManagedSystemError as error:
+        if released is None:
+            raise
+        print(f"mapek: {error}", file=sys.stderr)
+        return SYSTEM_FAILED
 
 
 def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:

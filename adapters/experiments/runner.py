@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, NamedTuple
 
@@ -128,8 +129,12 @@ def run_agents(
     seconds = 0.0
     finished = {agent: folder.finished(agent) for agent in configs}
     tasks: list[Task] = []
+    plants: list[str] = []
     for agent, config in configs.items():
         checked = check(config, lend=lend)
+        if not lend.look(config.system).redrivable and not finished[agent]:
+            plants.append(agent)
+            continue
         missing = [unit for unit in range(config.units) if unit not in finished[agent]]
         seconds += len(missing) * trial_seconds(config, checked)
         for first, count in chunks(missing, chunk_size(config, checked, most)):
@@ -144,6 +149,8 @@ def run_agents(
         dynamic_ncols=True, smoothing=0.1,
     ) as bar:  # fmt: skip
         try:
+            for agent in plants:
+                _run_plant(configs[agent], agent, folder, lend, trace, prepare, bar)
             if workers > 1 and prepare is None:
                 _run_in_workers(tasks, list(map(folder.assembly, configs)), workers, bar, lend)
             else:
@@ -155,6 +162,26 @@ def run_agents(
             raise Stopped(f"stopped. {folder.kept()}") from None
     results = {agent: folder.finished(agent) for agent in configs}
     return {agent: [found[unit] for unit in sorted(found)] for agent, found in results.items()}
+
+
+def _run_plant(
+    config: Config,
+    agent: str,
+    folder: RunFolder,
+    lend: Lender,
+    trace: tuple[int, int] | None,
+    prepare: Callable[[Loop], object] | None,
+    bar: Any,
+) -> None:
+    """Run what cannot be driven again: in this process, one unit after the other, into a log."""
+    from adapters.experiments.logged import run_logged  # stores are of no use to others
+
+    stem = Path(folder.chunk_stem(agent, 0, config.units))
+    try:
+        run_logged(config, folder.log_path(agent), stem, lend=lend, trace=trace, prepare=prepare, on_passes=bar.update)
+    except MapekError as error:
+        error.args = (f"{error} {folder.kept()}",)
+        raise
 
 
 def chunk_size(config: Config, checked: Checked, workers: int) -> int:

@@ -13,11 +13,13 @@ from adapters.buses.messages import State, Table
 from adapters.processes.detached import Brought, Detached
 from adapters.processes.replacing import Unit, Wanted, reason
 from adapters.processes.role import IDLE, Role, plain
+from adapters.stores.begun import BROKEN_OFF
 from knowledge import ChangePlan, Observation, Record
 from mape.config import Config
 from mape.errors import BusError, ManagedSystemError
 from mape.execute import Execute
 from mape.execute.adoption import fitting
+from mape.execute.attempts import Attempts
 from mape.execute.checkpoint import SHARED, carried_by, take_up
 from mape.loop import build_execute
 from mape.states import faults
@@ -103,7 +105,7 @@ class ExecuteRole(Role):
             # In lockstep that of the state's own pass; who runs freely may be further behind with its plans.
             in_force = unit.component.plan
             self.member.watch(unit.loop, 0 if in_force is None else in_force.pass_no + 1)
-        self._note_aborted(unit)
+        self._count_attempts(unit)
 
     def _from_the_first(self, unit: Unit, number: int, names: list[str]) -> None:
         """Leave a state aside that does not tell all that the system carried, and begin with the first episode.
@@ -137,17 +139,30 @@ class ExecuteRole(Role):
             self.config, self.systems[unit.loop], unit.knowledge, unit.outbox.append, trial, loop
         )
 
-    def _note_aborted(self, unit: Unit) -> None:
-        """Note an episode that was broken off and cannot be driven again."""
-        begun = self.member.joined.begun[unit.loop]
-        if begun > unit.component.passes and not self.systems[unit.loop].redrivable and not unit.done:
-            self.member.note(
-                "aborted",
-                f"episode {begun} was broken off with its process, and the system cannot be driven through it again; "
-                "it was begun anew",
-                unit.loop,
-                begun,
-            )
+    def _count_attempts(self, unit: Unit) -> None:
+        """Have each attempt at an episode told, and that which was broken off with the process before this one.
+
+        Raises
+        ------
+        ManagedSystemError
+            It was the last attempt that is allowed.
+        """
+        attempts: Attempts = unit.component.attempts
+        system, number = self.systems[unit.loop], unit.component.passes + 1
+
+        def begins(number: int) -> None:
+            if not system.redrivable:
+                self.member.note("begun", "", unit.loop, number, surely=not self.free)
+
+        def breaks_off(number: int, why: str) -> None:
+            self.member.note("aborted", why[:2000], unit.loop, number)
+
+        attempts.on_begin, attempts.on_abort = begins, breaks_off
+        if system.redrivable or unit.done:
+            return
+        attempts.go_on_after(self.member.joined.failed[unit.loop])
+        if self.member.joined.begun[unit.loop] >= number:
+            attempts.broken_off(number, ManagedSystemError(f"{system.name}: {BROKEN_OFF.format(number)}."))
 
     def _handle(self, unit: Unit, record: Record) -> None:
         assert isinstance(record, ChangePlan)
@@ -172,9 +187,7 @@ class ExecuteRole(Role):
         """Drive the next episode."""
         number = unit.component.passes + 1
         self._swap(unit, number)
-        if not self.systems[unit.loop].redrivable:
-            self.member.note("begun", "", unit.loop, number, surely=not self.free)
-        elif number % self.member.joined.snapshot_every == 0:
+        if self.systems[unit.loop].redrivable and number % self.member.joined.snapshot_every == 0:
             unit.component.look_at(number)  # the state that is kept after it tells what was seen
         unit.component.drive()
 

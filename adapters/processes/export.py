@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.chunk import write_heads
+from adapters.results.chunk import READINGS, write_heads
 from adapters.results.files import whole
 from adapters.results.table import BLOCK, from_rows
 from adapters.stores.ledger import Ledger
@@ -21,8 +21,10 @@ from mape.errors import ResultsError
 from mape.trials import TrialResult, steps_and_alarms
 
 
-def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
+def export(config: Config, ledger: Ledger, stem: Path, trace: npt.NDArray[np.void] | None = None) -> list[TrialResult]:
     """Write a complete run as one chunk of results: ``STEM.rows``, ``STEM.npz`` and, last, ``STEM.json``.
+
+    `trace` are the steps that were traced of unit 0.
 
     Raises
     ------
@@ -34,12 +36,18 @@ def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
     results: list[TrialResult] = []
     arrays: dict[str, npt.NDArray[Any]] = {}
     digest = hashlib.sha256()
+    readings: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in READINGS}
+    aborted = [event for event in ledger.store.events() if event.kind == "aborted"]
     with whole(stem.with_suffix(".rows")) as file:
         for unit in range(ledger.units):
             trial, loop = divmod(unit, config.loops)
             steps, dropped, alarms = 0, 0, []
             for rows in rows_of(ledger, unit):
                 block = from_rows(trial, loop, rows).tobytes()
+                if trace is not None and unit == 0:
+                    inside = np.isin(rows["pass"], trace["episode"])
+                    for name, found_there in readings.items():
+                        found_there.append(rows[name][inside])
                 digest.update(block)
                 file.write(block)
                 more, alarmed = steps_and_alarms(rows)
@@ -65,8 +73,12 @@ def export(config: Config, ledger: Ledger, stem: Path) -> list[TrialResult]:
                     loop,
                     handed_over,
                     dropped,
+                    tuple((event.pass_no or 0, event.text) for event in aborted if event.loop == unit),
                 )
             )
+    if trace is not None:
+        arrays["trace"] = trace
+        arrays |= {f"readings_{name}": np.concatenate(parts) for name, parts in readings.items()}
     write_heads(stem, results, arrays, len(results) * config.episodes, digest.hexdigest())
     return results
 

@@ -1,9 +1,10 @@
 """Starts the five processes of a run on this machine, watches them, and starts them again when they die.
 
-Who died by a signal is started again at once. Who ended with an error gets one more try, for the error may have been
-the world's; where it comes again at the same place, the run ends with it. So it does where Knowledge fails again soon:
-with the disk full, each start of it makes room for a few passes more. Who is alive and says nothing for too long is
-hung: it is killed, and started again.
+Who died by a signal is started again at once. Where the system broke an episode off, Execute itself has begun it again
+as often as the config says (`mape.execute.attempts`), and the run ends. Who ended with another error gets one more try,
+for the error may have been the world's; where it comes again at the same place, the run ends with it. So it does where
+Knowledge fails again soon: with the disk full, each start of it makes room for a few passes more. Who is alive and says
+nothing for too long is hung: it is killed, and started again.
 
 All are started at once, and the roles hold until Knowledge, the one that was started here, has answered: at the same
 place there may be that of another run.
@@ -29,6 +30,9 @@ from adapters.buses.wire import LEASE_MS, Wire
 from adapters.roles import KNOWLEDGE, OPERATOR, ROLES
 from knowledge import MalformedRecord
 from mape.errors import BusError, ConfigError, MapekError
+
+SYSTEM_FAILED = 4
+"""Exit code of Execute where the system broke an episode off once too often: it is not started again over it."""
 
 LOOK_EVERY = 0.1
 """Seconds between two looks at the processes."""
@@ -241,6 +245,8 @@ class Supervisor:
                 return  # in the second case, Knowledge is still to say
         if code == 2:
             raise ConfigError(_last_sentence(child))
+        if code == SYSTEM_FAILED:
+            raise Failed(_last_sentence(child))
         now = time.monotonic()
         child.deaths.append((now, self._passes))
         if code >= 0:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adapters.replay.derivations import Derivation, FedByLog, WholeLoop, with_swaps
+from adapters.results.folder import LOGS_OF_AGENTS
 from adapters.stores import LOG_NAME, Store
 from adapters.stores.ledger import differences, layout_from
 from adapters.systems import make_system
@@ -34,6 +35,10 @@ def log_of(path: Path) -> Path | None:
         There is no such folder or file.
     """
     if path.is_dir():
+        several = sorted(path.glob(f"{LOGS_OF_AGENTS}*.sqlite"))
+        if several:
+            names = ", ".join(str(log) for log in several)
+            raise ConfigError(f"{path} holds a log for each agent; name one of them: {names}")
         return path / LOG_NAME if (path / LOG_NAME).is_file() else None
     if not path.exists():
         near = nearest_path(path, os.path.exists)

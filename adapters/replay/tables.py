@@ -13,6 +13,7 @@ from adapters.experiments.runner import run_agents
 from adapters.results import RunFolder
 from adapters.results.files import read_json, read_npz
 from adapters.results.table import COLUMNS, read_episodes
+from adapters.systems.declared import is_plant
 from mape.config import Config, from_table
 from mape.errors import ResultsError
 from mape.trials import TrialResult, combined_hash
@@ -53,6 +54,12 @@ def replay_tables(
         raise ResultsError(f"{path} holds an unfinished run; finish it with `mapek resume {path}`")
     stored = read_json(path / "result.json")
     configs = {agent: from_table(table, f"{path}, {agent}") for agent, table in manifest["agents"].items()}
+    for config in configs.values():
+        if is_plant(config.system):
+            raise ResultsError(
+                f"{path} holds a run over {config.system.id}, which cannot be driven again, and no log of it: there is "
+                "nothing that it could be compared with"
+            )
     with RunFolder(scratch, "replay", configs) as folder:
         results = run_agents(configs, folder, workers=workers, quiet=quiet)
     found = (said for agent, config in configs.items() for said in _differences(path, scratch, agent, config))

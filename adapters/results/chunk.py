@@ -89,7 +89,7 @@ def run_chunk(
             def ready(loop: Loop, unit: int = unit, steps: list[Any] = steps, kept: list[Loop] = kept) -> None:
                 kept.append(loop)
                 if trace is not None and unit == 0:
-                    loop.execute.record_trace(*trace, lambda number, rows: steps.append(_traced(number, rows)))
+                    loop.execute.record_trace(*trace, lambda number, rows: steps.append(traced(number, rows)))
                 if prepare is not None:
                     prepare(loop)
 
@@ -182,8 +182,17 @@ def read_chunk(stem: Path) -> list[TrialResult] | None:
                 f"Delete {stem}.* to have these trials run again."
             )
         stem.with_suffix(".npz").stat()
-        lists = ("alarms", "handed_over")
-        return [TrialResult(**{**one, **{name: tuple(one[name]) for name in lists}}) for one in head["trials"]]
+        return [
+            TrialResult(
+                **{
+                    **one,
+                    "alarms": tuple(one["alarms"]),
+                    "handed_over": tuple(one["handed_over"]),
+                    "aborted": tuple((number, why) for number, why in one.get("aborted", ())),
+                }
+            )
+            for one in head["trials"]
+        ]
     except (OSError, KeyError, TypeError) as error:
         raise ResultsError(f"{stem}.* is damaged ({error}); delete it to have these trials run again") from error
 
@@ -211,7 +220,8 @@ def remove_parts(folder: Path) -> None:
         os.unlink(part)
 
 
-def _traced(number: int, steps: npt.NDArray[np.float64]) -> npt.NDArray[np.void]:
+def traced(number: int, steps: npt.NDArray[np.float64]) -> npt.NDArray[np.void]:
+    """Return the traced steps of an episode as they are stored, shape (steps,)."""
     block = np.empty(len(steps), TRACE_DTYPE)
     block["episode"] = number
     for i, name in enumerate(TRACE_COLUMNS):

@@ -11,6 +11,7 @@ trace-AGENT.npy       steps of the traced episodes of unit 0
 readings-AGENT.npz    what its detectors read at the end of each of them: pass, statistic, alarm (episodes x detectors)
 result.json           what the command found, with the hashes; its presence says that the run is complete
 figures/              PNG and PDF
+log.sqlite            the log, of `up` and `serve`, and of a run over a plant; of several agents log-AGENT.sqlite
 
 A unit of work is a trial, or one loop of it: unit ``trial * loops + loop``. What is said of trials below is of units.
 """
@@ -37,6 +38,7 @@ from adapters.results.chunk import READINGS, read_arrays, read_chunk, remove_par
 from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
 from adapters.results.own_code import other_versions, own_modules
 from adapters.results.table import read_episodes, read_last, write_npz
+from adapters.stores import LOG_NAME
 from adapters.versions import versions
 from mape.config import Config
 from mape.errors import MapekError, ResultsError
@@ -46,6 +48,9 @@ from mape.trials import TrialResult
 
 FORMAT = 2
 """Version of what stands in the folder; an unfinished run of another one is not gone on with."""
+
+LOGS_OF_AGENTS = "log-"
+"""With what the names of logs begin where a run has several agents."""
 
 BEGUN_BY = ("command", "cwd")
 """Entries of a manifest that do not say what runs: the same run may be gone on with from elsewhere."""
@@ -255,6 +260,10 @@ class RunFolder:
         for agent in self.configs:
             write_json(self.path / f"config-{agent}.json", wanted["agents"][agent])
 
+    def log_path(self, agent: str) -> Path:
+        """Return where the log of an agent's run over a plant belongs."""
+        return self.path / (LOG_NAME if len(self.configs) == 1 else f"{LOGS_OF_AGENTS}{agent}.sqlite")
+
     def chunk_stem(self, agent: str, first: int, count: int) -> str:
         """Return where a chunk's results belong."""
         folder = self.path / "chunks" / agent
@@ -321,7 +330,7 @@ class RunFolder:
         """Say in a sentence what there is of the run, and how to go on."""
         if (self.path / "result.json").exists():
             return f"The run is complete; all of it is in {self.path}."
-        if self._kind == "up":
+        if self._kind == "up" or any(self.log_path(agent).exists() for agent in self.configs):
             return f"All that was logged is kept; `mapek resume {self.path}` continues."
         kept = sum(len(self.finished(agent)) for agent in self.configs)
         wanted = sum(config.units for config in self.configs.values())

@@ -226,6 +226,10 @@ class Ledger:
             number = max((self.last(unit)[0] for unit in range(self.units)), default=0)
         self.store.event(role, kind, text, loop, number)
 
+    def ended(self, loop: int) -> bool:
+        """Whether a loop has all its passes, and its Q-table at the end."""
+        return loop in self._final
+
     @property
     def complete(self) -> bool:
         """Whether every loop has all its passes, and its Q-table at the end."""

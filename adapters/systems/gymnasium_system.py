@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -113,6 +114,7 @@ class GymnasiumSystem:
 
     def __init__(self, env: gymnasium.Env[Any, Any], config: SystemConfig) -> None:
         self.env = env
+        self.config = config
         self.name = config.id
         self._base: Any = env.unwrapped
         if not isinstance(env.action_space, spaces.Discrete):
@@ -144,6 +146,7 @@ class GymnasiumSystem:
         self._actions = self._action_range()
         self._windows: tuple[int, int, tuple[int, ...]] | None = None
         self._connected = False
+        self._due: list[Callable[[], object]] = []  # what is to be done to a plant once it is connected
 
     @property
     def n_actions(self) -> int:
@@ -235,12 +238,15 @@ class GymnasiumSystem:
             raise ValueError(
                 f"{self.name} has no actions in reserve (no enable_actions), so {actions} cannot be enabled"
             )
-        self._base.enable_actions(actions)
+        self._once_connected(lambda: self._base.enable_actions(actions))
         self._windows = None
 
     def get_state(self) -> Any:
-        """Return what the environment carries from one episode to the next, or None where it does not say."""
-        return self._base.get_state() if self.says_state else None
+        """Return what the environment carries from one episode to the next, or None where it does not say.
+
+        One that cannot be driven again is not asked before it is connected.
+        """
+        return self._base.get_state() if self.says_state and (self.redrivable or self._connected) else None
 
     def set_state(self, state: Any) -> None:
         """Let the environment take up what `get_state` returned.
@@ -251,7 +257,7 @@ class GymnasiumSystem:
             The environment does not take a state, or not this one.
         """
         if self.says_state:
-            self._base.set_state(state)
+            self._once_connected(lambda: self._base.set_state(state))
         elif state is not None:
             raise ValueError(f"{self.name} takes no state (no get_state and set_state); give None")
         self._windows = None
@@ -262,6 +268,31 @@ class GymnasiumSystem:
         What the environment says itself, by `get_state`, is left out unless it is to be `stated` too.
         """
         return held(self.env, base=stated or not self.says_state)
+
+    def renew(self) -> None:
+        """Close the environment, and make another one.
+
+        Raises
+        ------
+        ConfigError
+            There is none any more.
+        """
+        try:
+            self.env.close()
+        except faults():
+            pass  # it has failed already
+        self.env = make_env(self.config)
+        self._base = self.env.unwrapped
+        self._connected = False
+        self._due.clear()
+        self._windows = None
+
+    def _once_connected(self, do: Callable[[], object]) -> None:
+        """Do something to the environment; to a plant that is not connected yet, once it is."""
+        if self.redrivable or self._connected:
+            do()
+        else:
+            self._due.append(do)
 
     def close(self) -> None:
         """Close the environment."""
@@ -275,12 +306,16 @@ class GymnasiumSystem:
     def _connect(self, number: int) -> None:
         try:
             connect(self.env)
+            for do in self._due:
+                do()
         except faults() as error:
+            going_on = ", and to go on from where it was," if self._due else ""
             raise ManagedSystemError(
-                f"{self.name} raised {told(error)}, when it was to connect before episode {number}. The {number - 1} "
-                "passes before it stand in the log."
+                f"{self.name} raised {told(error)}, when it was to connect{going_on} before episode {number}. The "
+                f"{number - 1} passes before it stand in the log."
             ) from error
         self._connected = True
+        self._due.clear()
 
     def _action_range(self) -> range:
         # Asked at each reset: an environment may reassign its action space.

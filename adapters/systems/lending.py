@@ -80,7 +80,6 @@ class Lender:
 class _Lent(GymnasiumSystem):
     def __init__(self, env: Any, config: SystemConfig) -> None:
         super().__init__(env, config)
-        self.config = config
         self.lent = False
         self.again = self.rules is not None and (self.says_state or not hasattr(env.unwrapped, "enable_actions"))
         self._first = self.get_state() if self.again else None

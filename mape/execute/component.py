@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isfinite
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from knowledge import ChangePlan, Knowledge, Observation, QTable
 from mape.errors import ConfigError, ManagedSystemError, MapekError, NonFiniteError, PartError
 from mape.execute import adoption, binding, drive, episode
+from mape.execute.attempts import Attempts
 from mape.execute.checkpoint import Checkpoint, Held, carried_by, differing, held_by, take_up
 from mape.execute.refusals import broken_off, check_offer, refused
 from mape.execute.rules import rate_array
@@ -25,6 +26,8 @@ SIGNALS = ("return", "steps", "td_error", "q_change")
 """Signals of every run: return, steps, mean |TD error|, largest absolute change of Q; the system's own follow."""
 
 _new = tuple.__new__
+
+T = TypeVar("T")
 
 
 class Execute:
@@ -53,6 +56,8 @@ class Execute:
         Whether the system's action mask limits the greedy choice and the TD target too, not only exploration.
     max_actions
         Largest number of actions that the run's records can hold.
+    retries
+        How often an episode that the system broke off is begun again, by another object of the system.
     checkpoint
         State and Q-table, as `state` gives them. This Execute goes on from there, as by `restore`.
 
@@ -79,6 +84,7 @@ class Execute:
         engine: str = "auto",
         mask_greedy: bool = False,
         max_actions: int = 64,
+        retries: int = 0,
         checkpoint: tuple[Json, QTable] | None = None,
     ) -> None:
         self.system = system
@@ -90,6 +96,7 @@ class Execute:
         self._loop = knowledge.log.loop
         self._seeds = (seed, loop, trial)
         self._max_actions = max_actions
+        self.attempts = Attempts(system, retries)
         self._own_signals = system.signal_names
         self.trace: Callable[[int, npt.NDArray[np.float64]], object] | None = None
         self._traced = range(0)
@@ -166,7 +173,7 @@ class Execute:
             rates = adoption.checked_rate(plan, self.learner)
         if add or drop or enable or adopt is not None:
             if self._table is None:
-                self._begin_first()
+                self._tried(1, self._begin_first)
             table = adoption.table_after(plan, self.q_table, self.available, self.system, self._knowledge)
             if enable:
                 self._enable(plan)
@@ -180,6 +187,8 @@ class Execute:
     def drive(self) -> None:
         """Run the next episode under the plan in force and send its Observation.
 
+        One that the system breaks off is begun again as `attempts` say.
+
         Raises
         ------
         ManagedSystemError
@@ -187,20 +196,43 @@ class Execute:
         NonFiniteError
             A reward, a TD error or a signal was NaN or infinite. The Q-table is as before the episode.
         """
+        number = self.passes + 1
+        if self.attempts.retries:
+            self.look_at(number)  # another object that does not stand where this one did is not driven
+        steps, signals = self._tried(number, self._attempt)
+        self.attempts.over()
+        self.observe(steps, signals)
+
+    def _tried(self, number: int, attempt: Callable[[int], T]) -> T:
+        """Return what an attempt at episode `number` gives, or the next one where the system breaks it off."""
+        again = False
+        while True:
+            try:
+                if again:
+                    self.attempts.begun_again(number, self._enabled)
+                return attempt(number)
+            except ManagedSystemError as error:
+                self._begun = 0
+                self.attempts.broken_off(number, error)
+                again = True
+
+    def _attempt(self, number: int) -> tuple[int, dict[str, float]]:
+        """Drive episode `number`; return its steps and signals."""
         plan = self.plan
         if plan is None:
             raise PartError("no plan is in force; plan 0 starts a run")
-        number = self.passes + 1
         at = self.uniforms.find(self.passes)
 
         available = self.system.available(number) if self.rules is not None else None
         if available is None:
             if self._table is None:
-                self._begin_first()
+                self._begin_first(number)
             if self._begun == number:
                 available, self._begun = self.available, 0
             else:
                 available = self._begin(number, at)
+        else:
+            self.attempts.on_begin(number)
         if available is not self.available:
             check_offer(available, self.system, number, self._max_actions)
             self._set_rows(available)
@@ -228,7 +260,7 @@ class Execute:
             self._add_own_signals(signals, number)
         if tracing and self.trace is not None:
             self.trace(number, trace[:steps])
-        self.observe(steps, signals)
+        return steps, signals
 
     def observe(self, steps: int, signals: dict[str, float]) -> None:
         """Send the Observation of the next pass, whose episode is driven; if it is not taken, nothing was learnt."""
@@ -325,6 +357,7 @@ class Execute:
             )
         rate = self._rate if at.plan is None else adoption.checked_rate(at.plan, self.learner)
         take_up(self.system, at.system, at.enabled)
+        self.attempts.carried = at.system
         self.passes, self.plan, self._rate, self._enabled, self._held = at.passes, at.plan, rate, at.enabled, at.held
         self._take_actions(at.available, self.passes)
         self._set_table(table.copy())
@@ -401,10 +434,10 @@ class Execute:
             *self._limits,
         )
 
-    def _begin_first(self) -> None:
-        """Begin episode 1, which tells what the Q-table has rows for; its drive goes on from there."""
-        first = self._begin(1, self.uniforms.find(0))
-        self._begun = 1
+    def _begin_first(self, number: int) -> None:
+        """Begin episode `number`, 1, which tells what the Q-table has rows for; its drive goes on from there."""
+        first = self._begin(number, self.uniforms.find(0))
+        self._begun = number
         self._set_up(first)
 
     def _set_up(self, first: tuple[int, ...]) -> None:
@@ -414,6 +447,7 @@ class Execute:
     def _begin(self, number: int, at: int) -> tuple[int, ...]:
         seed, *key = self._seeds
         sequence = np.random.SeedSequence(entropy=seed, spawn_key=(*key, number))
+        self.attempts.on_begin(number)
         block = self.uniforms.values[at : at + self._system_draws].copy()  # a system may keep what it is told
         told = Episode(number, int(sequence.generate_state(1)[0]), block)
         try:

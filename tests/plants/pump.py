@@ -43,7 +43,7 @@ class Pump(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        assert self.connected
+        assert self.connected or self.redrivable
         self.episode, self.steps = (options or {}).get("episode", 0), 0
         write(f"reset {self.episode}")
         self._fail()
@@ -67,9 +67,11 @@ class Pump(gymnasium.Env):
                     time.sleep(0.05)
 
     def get_state(self):
+        assert self.connected or self.redrivable
         return {"turned": self.turned}
 
     def set_state(self, state):
+        assert self.connected or self.redrivable
         self.turned = state["turned"]
 
     def close(self):

@@ -98,7 +98,7 @@ def test_other_commands_make_no_plant(here, looks):
     assert diary(here) == []
 
 
-@pytest.mark.parametrize("command", ["up"])
+@pytest.mark.parametrize("command", ["run", "up"])
 def test_replay_and_log_do_not_touch_a_plant(here, command):
     config = write_config(here, plant())
     run(command, str(config), "--out", "out", *SHORT, cwd=here)
