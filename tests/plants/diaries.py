@@ -8,7 +8,7 @@ EPISODES = 12
 
 def plant(episodes: int = EPISODES, name: str = "Pump", system: Any = (), **over: Any) -> dict[str, Any]:
     """A config of a plant."""
-    return {"name": "plant", "episodes": episodes, "system": {"id": f"pump:{name}-v0", **dict(system)}, **over}
+    return {"name": "plant", "episodes": episodes, "system": {"id": f"pump:Plant{name}-v0", **dict(system)}, **over}
 
 
 def diary(folder: Path) -> list[str]:

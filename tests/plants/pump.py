@@ -88,5 +88,5 @@ class Tank(Pump):
         return super().reset(seed=seed, options=options)
 
 
-gymnasium.register("Pump-v0", Pump, max_episode_steps=3)
-gymnasium.register("Tank-v0", Tank, max_episode_steps=3)
+gymnasium.register("PlantPump-v0", Pump, max_episode_steps=3)
+gymnasium.register("PlantTank-v0", Tank, max_episode_steps=3)

@@ -165,7 +165,7 @@ def test_a_system_that_can_be_driven_again_has_the_same_rule(here, command):
     config = write_config(here, broken("raise", 2, 1, 1, name="Tank"))
     said = run(command, str(config), "--out", "again", *SHORT, cwd=here).stdout
     assert resets(here) == [*range(1, AT + 1), *range(AT, EPISODES + 1)]
-    assert f"episode {AT}: pump:Tank-v0 raised OSError: the valve is stuck" in said
+    assert f"episode {AT}: pump:PlantTank-v0 raised OSError: the valve is stuck" in said
     result = json.loads((here / "again" / "result.json").read_bytes())
     assert [one["episode"] for one in result["trials"][0]["aborted"]] == [AT]
 

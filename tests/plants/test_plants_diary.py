@@ -58,7 +58,7 @@ def test_serve_makes_a_plant_in_execute_alone(here):
 
 def test_check_leaves_a_plant_alone_unless_it_is_asked_and_then_has_one_of_it(here):
     config = write_config(here, plant())
-    for name in (str(config), "pump:Pump-v0"):
+    for name in (str(config), "pump:PlantPump-v0"):
         (here / "diary").unlink(missing_ok=True)
         said = run("check", name, cwd=here).stdout
         assert diary(here) == ["made", "closed"]
@@ -183,7 +183,7 @@ def test_python_makes_a_loop_without_touching_its_system(here):
 def test_reproduce_leaves_a_plant_that_takes_the_place_of_its_system_in_one_piece(here):
     """No plant has the paper's drifts; that is said, and before it is driven."""
     done = subprocess.run(
-        [*MAPEK, "reproduce", "jump", "--set", 'system={id = "pump:Pump-v0"}', "--trials", "1", "--set", "episodes=12",
+        [*MAPEK, "reproduce", "jump", "--set", 'system={id = "pump:PlantPump-v0"}', "--trials", "1", "--set", "episodes=12",
          "--no-statistics", "--no-figures", "--out", "out", "-q"],
         cwd=here, capture_output=True, text=True, timeout=90, check=False,
     )  # fmt: skip
