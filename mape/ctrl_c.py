@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Self
+
+SAID_AFTER = 1.0
+"""Seconds after a Ctrl-C after which it is said for what the program waits."""
+
+on_wait: list[Callable[[str], object]] = []
+"""Called with a sentence where a Ctrl-C was heard and what is at work does not come to its end."""
 
 
 class CtrlC:
@@ -13,6 +20,11 @@ class CtrlC:
 
     So it is in the main thread, and where nobody else has set how SIGINT is handled. Else nothing changes: within
     another one it is that one which hears.
+
+    Parameters
+    ----------
+    waits_for
+        Says as a clause what is at work, for `on_wait`.
 
     Examples
     --------
@@ -28,8 +40,10 @@ class CtrlC:
     stopped
     """
 
-    def __init__(self) -> None:
+    def __init__(self, waits_for: Callable[[], str] = lambda: "what is at work") -> None:
         self._heard = self._set = False
+        self._waits_for = waits_for
+        self._say: threading.Timer | None = None
         self._outer: CtrlC | None = None
 
     def __enter__(self) -> Self:
@@ -45,6 +59,8 @@ class CtrlC:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         if self._set:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+        if self._say is not None:
+            self._say.cancel()
         if error is None:
             self.check()
 
@@ -63,3 +79,11 @@ class CtrlC:
         if self._heard:
             raise KeyboardInterrupt
         self._heard = True
+        self._say = threading.Timer(SAID_AFTER, self._tell)
+        self._say.daemon = True
+        self._say.start()
+
+    def _tell(self) -> None:
+        if self._heard:
+            for tell in on_wait:
+                tell(f"waiting for {self._waits_for()}; Ctrl-C again ends it at once")

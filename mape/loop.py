@@ -218,7 +218,7 @@ class Loop:
         KeyboardInterrupt
             After a Ctrl-C, when the record is there; after a second one at once.
         """
-        with CtrlC():
+        with CtrlC(self._at_work):
             record = self.bus.deliver()
             if record is None:
                 if self.execute.plan is None:
@@ -241,7 +241,7 @@ class Loop:
             After a Ctrl-C, between two passes, so that another `run` goes on; after a second one at once.
         """
         execute, drive, settle = self.execute, self.execute.drive, self.bus.run
-        with CtrlC() as ctrl_c:
+        with CtrlC(self._at_work) as ctrl_c:
             if execute.plan is None and self.knowledge.plan is None:
                 self.plan.start(self.log.loop)
             settle()
@@ -288,6 +288,12 @@ class Loop:
         """Let the components go, which hold one another: what a loop takes is then free at once."""
         self.bus.close()
         self.knowledge.serve_q_table(None)
+
+    def _at_work(self) -> str:
+        number, steps = self.execute.driving, self.execute.steps
+        if not number:
+            return f"the parts of the loop, after episode {self.execute.passes}"
+        return f"{self.system.name}, in {f'step {steps + 1}' if steps >= 0 else 'the reset'} of episode {number}"
 
     def _swap_before(self, number: int) -> None:
         while self._swaps and self._swaps[0].pass_no <= number:

@@ -22,6 +22,7 @@ from adapters.results import RunFolder
 from adapters.results.files import cannot_write, try_whole, write_json
 from adapters.results.folder import default_path
 from adapters.systems.lending import Lender
+from mape import ctrl_c
 from mape.config import Config, load
 from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
@@ -34,6 +35,8 @@ def prepare() -> None:
     # Python looks for garbage a last time, among all that Numba keeps, which takes longer than many a run.
     atexit.register(gc.freeze)
     announce_compilation()
+    if not ctrl_c.on_wait:
+        ctrl_c.on_wait.append(lambda sentence: print(f"mapek: {sentence}", file=sys.stderr, flush=True))
 
 
 def config_of(path: str | Path, chosen: argparse.Namespace, agent: str | None = None, **defaults: Any) -> Config:

@@ -147,7 +147,8 @@ def parser() -> argparse.ArgumentParser:
     _keeps(up)
     up.add_argument(
         "--hang-after", type=_seconds, default=60.0, metavar="S",
-        help="restart a process that is alive and silent for so long; longer than an episode takes (default 60)",
+        help="restart a process that is alive and silent for so long; Execute, where its system makes no step for so "
+        "long, however long an episode takes (default 60)",
     )  # fmt: skip
     _secure(up)
 
@@ -167,6 +168,10 @@ def parser() -> argparse.ArgumentParser:
     _keeps(serve)
     _secure(serve)
     _patient(serve)
+    serve.add_argument(
+        "--hang-after", type=_seconds, metavar="S",
+        help="execute: end where the system makes no step for so long (default: wait)",
+    )  # fmt: skip
     serve.add_argument("--log", metavar="FILE", help=argparse.SUPPRESS)
     serve.add_argument("--leash", action="store_true", help=argparse.SUPPRESS)
 

@@ -16,12 +16,14 @@ from adapters.cli.terminal import Clean
 from adapters.processes.serve import (
     Terminated,
     leash,
+    open_ledger,
     serve_knowledge,
     serve_role,
     terminated_by_signal,
 )
 from adapters.processes.supervise import SYSTEM_FAILED
 from adapters.stores import LOG_NAME
+from adapters.stores.begun import go_on
 from mape.config import Config
 from mape.errors import ConfigError, ManagedSystemError
 
@@ -53,12 +55,17 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
             f"role {chosen.role} {'listens' if knowledge else 'connects'}: give "
             f"{'--listen' if knowledge else '--connect'} ENDPOINT, such as tcp/127.0.0.1:7447, and not the other"
         )
+    if chosen.hang_after is not None and chosen.role != "execute":
+        raise ConfigError(
+            f"--hang-after {chosen.hang_after:g} is of role execute, which ends itself where its system makes no step "
+            f"for so long; {chosen.role} has no system"
+        )
     tls = None if chosen.tls is None else Path(chosen.tls)
     wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure, chosen.patience)
     if tls is not None:
         _keep_standard_output()
     if not knowledge:
-        serve_role(config, chosen.role, wire, released)
+        serve_role(config, chosen.role, wire, released, chosen.hang_after)
         return 0
     kept = {"durability": chosen.durability, "snapshot_every": chosen.snapshot_every}
     if chosen.log is not None:  # somebody else makes the tables
@@ -84,5 +91,8 @@ def _serve_with_results(chosen: argparse.Namespace, config: Config, wire: Wire, 
     label = chosen.agent or config.name
     wire.check_listen()  # no folder is begun by who cannot listen
     with open_folder(chosen, "up", config.name, {label: config}, check=lambda config: None) as folder:
+        ledger = open_ledger(config, folder.path / LOG_NAME, chosen.durability)
+        with ledger.store:
+            go_on(ledger)
         serve_knowledge(config, wire, folder.path / LOG_NAME, **kept)  # type: ignore[arg-type]
         up.conclude(chosen, config, label, folder)

@@ -26,6 +26,7 @@ from adapters.results import RunFolder
 from adapters.roles import KNOWLEDGE, ROLES
 from adapters.scratch import scratch
 from adapters.stores import LOG_NAME, Swap
+from adapters.stores.begun import go_on
 from adapters.systems.declared import is_plant
 from knowledge import from_json
 from mape.config import Config, parts_of
@@ -125,6 +126,7 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
     wait_for_orphans(folder.path)
     ledger = open_ledger(config, folder.path / LOG_NAME, chosen.durability)
     with ledger.store:
+        go_on(ledger)
         if ledger.complete:
             return  # only its tables are still to be made
     path = folder.path / f"config-{label}.json"
@@ -136,6 +138,7 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         ),
         **{role: command_of(role, path, "--connect", wire.endpoint, *shared) for role in ROLES},
     }
+    commands["execute"] += ["--hang-after", str(chosen.hang_after)]
     if not chosen.quiet:
         print(f"five processes meet on {wire.endpoint}; the log is {folder.path / LOG_NAME}", file=sys.stderr)
     screen = Screen(chosen, config)

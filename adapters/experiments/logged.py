@@ -17,7 +17,7 @@ from adapters.processes.role import plain
 from adapters.processes.serve import open_ledger
 from adapters.results.chunk import traced
 from adapters.results.files import whole
-from adapters.stores.begun import BROKEN_OFF, begins, begun, breaks_off
+from adapters.stores.begun import begins, breaks_off, go_on
 from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
 from adapters.systems.lending import Lender
@@ -65,6 +65,7 @@ def run_logged(
     """
     ledger = open_ledger(config, log, "normal")
     with ledger.store:
+        go_on(ledger)
         for unit in range(config.units):
             if ledger.ended(unit):
                 on_passes(config.episodes)
@@ -127,10 +128,6 @@ class _Unit:
             loop.go_on(self._past(), self._read)
             ledger.commit()
         loop.knowledge.serve_q_table(self._read_now)
-        number = loop.execute.passes + 1
-        if begun(store, self._unit) >= number:
-            breaks_off(ledger, f"{BROKEN_OFF.format(number)}; it is begun anew", self._unit, number)
-            ledger.commit()
         loop.execute.attempts.on_begin = self._begins
         loop.execute.attempts.on_abort = self._breaks_off
         if self._trace is not None:

@@ -26,7 +26,7 @@ from adapters.results.folder import assemble
 from adapters.systems import make_system
 from adapters.systems.declared import declared, is_plant
 from adapters.systems.lending import Lender
-from mape import compose
+from mape import compose, ctrl_c
 from mape.config import Config
 from mape.errors import MapekError
 from mape.loop import Loop
@@ -251,7 +251,7 @@ def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], worker
     context = multiprocessing.get_context("spawn")
     others = workers - 1
     before = signal.getsignal(signal.SIGINT)
-    interrupted = False
+    waits: threading.Timer | None = None
     try:
         with _Pool(others, mp_context=context, initializer=_start_worker) as pool:
             try:
@@ -269,12 +269,21 @@ def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], worker
             except KeyboardInterrupt:
                 # The others end what they are at. Another Ctrl-C ends them at once; as an exception it would break in
                 # on the pool's end, which then would be waited for in vain.
-                interrupted = True
                 signal.signal(signal.SIGINT, _kill_workers)
+                waits = threading.Timer(ctrl_c.SAID_AFTER, _tell_waiting)
+                waits.daemon = True
+                waits.start()
                 raise
     finally:
-        if interrupted:
+        if waits is not None:
+            waits.cancel()
             signal.signal(signal.SIGINT, before)
+
+
+def _tell_waiting() -> None:
+    busy = len(multiprocessing.active_children())
+    for tell in ctrl_c.on_wait:
+        tell(f"waiting for what {busy} worker processes are at; Ctrl-C again ends them at once")
 
 
 def _kill_workers(number: int, frame: FrameType | None) -> None:

@@ -11,6 +11,7 @@ from typing import Any, cast
 from adapters.buses.member import Asked, Member
 from adapters.buses.messages import State, Table
 from adapters.processes.detached import Brought, Detached
+from adapters.processes.pulse import Pulse
 from adapters.processes.replacing import Unit, Wanted, reason
 from adapters.processes.role import IDLE, Role, plain
 from adapters.stores.begun import BROKEN_OFF
@@ -39,12 +40,17 @@ class ExecuteRole(Role):
         As `Role` takes them.
     systems
         Managed systems that are there already; those that other loops need are made. `run` closes all of them.
+    hang_after
+        Seconds without a step after which an episode is given up, and this process with it; None for ever.
     """
 
     first = 0
 
-    def __init__(self, name: str, config: Config, member: Member, systems: list[Any]) -> None:
+    def __init__(
+        self, name: str, config: Config, member: Member, systems: list[Any], hang_after: float | None = None
+    ) -> None:
         super().__init__(name, config, member)
+        self._pulse = Pulse(lambda: self.member, self._driven, hang_after)
         self.systems = systems
         self.free = config.execute.mode == "free"
 
@@ -56,8 +62,11 @@ class ExecuteRole(Role):
         MapekError
             A part or the system raised, or Knowledge refuses this role.
         """
-        with self._closing():
+        with self._closing(), self._pulse:
             super().run()
+
+    def _driven(self) -> dict[int, Execute]:
+        return {unit.loop: unit.component for unit in [*self.units] if unit.component is not None}
 
     @contextmanager
     def _closing(self) -> Iterator[None]:
@@ -158,10 +167,11 @@ class ExecuteRole(Role):
             self.member.note("aborted", why[:2000], unit.loop, number)
 
         attempts.on_begin, attempts.on_abort = begins, breaks_off
-        if system.redrivable or unit.done:
+        if unit.done:
             return
-        attempts.go_on_after(self.member.joined.failed[unit.loop])
-        if self.member.joined.begun[unit.loop] >= number:
+        last = self.member.joined.last[unit.loop][0]
+        attempts.go_on_after(last + 1, self.member.joined.failed[unit.loop])
+        if not system.redrivable and self.member.joined.begun[unit.loop] >= number:
             attempts.broken_off(number, ManagedSystemError(f"{system.name}: {BROKEN_OFF.format(number)}."))
 
     def _handle(self, unit: Unit, record: Record) -> None:
@@ -279,7 +289,7 @@ class FreeExecuteRole(ExecuteRole):
         """
         rate = self.config.execute.rate
         assert rate is not None
-        with self._closing(), self.member:
+        with self._closing(), self._pulse, self.member:
             self.begin()
             for unit in self.units:
                 self._catch_up(unit)

@@ -11,8 +11,12 @@ from mape.config import Config
 from mape.loop import layout_of
 
 
-def make_role(name: str, config: Config, member_of: Callable[[Layout | None], Member]) -> Role:
+def make_role(
+    name: str, config: Config, member_of: Callable[[Layout | None], Member], hang_after: float | None = None
+) -> Role:
     """Make a role, with a link to Knowledge that `member_of` makes of the layout that Execute has to tell.
+
+    After `hang_after` seconds without a step Execute gives an episode up, and itself with it.
 
     Raises
     ------
@@ -32,7 +36,7 @@ def make_role(name: str, config: Config, member_of: Callable[[Layout | None], Me
             signals=layout.signals, detectors=layout.detectors, rates=layout.rates, max_actions=layout.max_actions
         )
         kind = FreeExecuteRole if config.execute.mode == "free" else ExecuteRole
-        return kind(name, config, member_of(told), [system])
+        return kind(name, config, member_of(told), [system], hang_after)
     except BaseException:
         system.close()
         raise

@@ -161,7 +161,9 @@ def serve_knowledge(
         ledger.store.close()
 
 
-def serve_role(config: Config, role: str, wire: Wire, released: threading.Event | None = None) -> None:
+def serve_role(
+    config: Config, role: str, wire: Wire, released: threading.Event | None = None, hang_after: float | None = None
+) -> None:
     """Be one of the roles until the run is complete.
 
     Parameters
@@ -170,6 +172,8 @@ def serve_role(config: Config, role: str, wire: Wire, released: threading.Event 
         What runs, which role it is, and where Knowledge listens.
     released
         Once it is set this role joins; None where it may at once.
+    hang_after
+        Of Execute: seconds without a step after which it ends this process; None for never.
 
     Raises
     ------
@@ -191,7 +195,7 @@ def serve_role(config: Config, role: str, wire: Wire, released: threading.Event 
         )
 
     try:
-        made = make_role(role, config, member_of)
+        made = make_role(role, config, member_of, hang_after)
         if released is not None:
             made.released = released
         made.run()

@@ -4,7 +4,8 @@ Who died by a signal is started again at once. Where the system broke an episode
 as often as the config says (`mape.execute.attempts`), and the run ends. Who ended with another error gets one more try,
 for the error may have been the world's; where it comes again at the same place, the run ends with it. So it does where
 Knowledge fails again soon: with the disk full, each start of it makes room for a few passes more. Who is alive and says
-nothing for too long is hung: it is killed, and started again.
+nothing for too long is hung: it is killed, and started again. Execute speaks while it drives, however long an episode
+takes, and ends itself where a step does not return.
 
 All are started at once, and the roles hold until Knowledge, the one that was started here, has answered: at the same
 place there may be that of another run.
@@ -33,6 +34,9 @@ from mape.errors import BusError, ConfigError, MapekError
 
 SYSTEM_FAILED = 4
 """Exit code of Execute where the system broke an episode off once too often: it is not started again over it."""
+
+HUNG = 5
+"""Exit code of an Execute in whose system a step did not return, and which may begin the episode again."""
 
 LOOK_EVERY = 0.1
 """Seconds between two looks at the processes."""
@@ -248,6 +252,10 @@ class Supervisor:
         if code == SYSTEM_FAILED:
             raise Failed(_last_sentence(child))
         now = time.monotonic()
+        if code == HUNG:
+            self.tell(f"{child.role} (process {child.pid}) ended itself: {_last_sentence(child)} It is started again.")
+            child.start()
+            return
         child.deaths.append((now, self._passes))
         if code >= 0:
             again = self._again(child, now)
@@ -288,7 +296,7 @@ class Supervisor:
 
     def _why(self, child: Child, code: int) -> str:
         if child.hung:
-            return f"silent for {self.hang_after:g} s; if an episode takes longer, give a longer --hang-after"
+            return f"silent for {self.hang_after:g} s; if that is not long for it, give a longer --hang-after"
         return f"exit code {code}"
 
     def _is_hung(self, child: Child) -> None:

@@ -35,5 +35,18 @@ def failures(store: Store, loop: int, number: int) -> int:
     return int(times) if episode == number else 0
 
 
+def go_on(ledger: Ledger) -> None:
+    """Note what was broken off with the processes of an earlier life, and allow as many attempts as ever.
+
+    For whoever lets a run go on: that an episode is begun anew is what was asked for.
+    """
+    for loop in range(ledger.units):
+        if (number := begun(ledger.store, loop)) > ledger.last(loop)[0]:
+            breaks_off(ledger, f"{BROKEN_OFF.format(number)}; it is begun anew", loop, number)
+    if ledger.store.facts().get(_FAILED):
+        ledger.store.set_facts(**{_FAILED: {}})
+    ledger.commit()
+
+
 BROKEN_OFF = "episode {} was broken off with its process, and the system cannot be driven through it again"
 """What is noted of an attempt of which nobody could tell more."""

@@ -37,16 +37,17 @@ class Attempts:
         self._system = system
         self.retries = retries
         self.failures = 0
+        self._before = 0, 0  # an episode, and how many attempts at it were broken off in processes before this one
         self.carried: Json = None
         self.on_begin: Callable[[int], object] = _unheard
         self.on_abort: Callable[[int, str], object] = _unheard
 
-    def go_on_after(self, failures: int) -> None:
-        """Go on with an episode of which so many attempts were broken off in processes before this one.
+    def go_on_after(self, number: int, failures: int) -> None:
+        """Go on where so many attempts at episode `number` were broken off in processes before this one.
 
         Where they were as many as are allowed, somebody has let it go on since, and as many are allowed anew.
         """
-        self.failures = failures % (self.retries + 1)
+        self._before = number, failures % (self.retries + 1)
 
     def broken_off(self, number: int, error: ManagedSystemError) -> None:
         """Count and tell that an attempt at episode `number` was broken off.
@@ -56,11 +57,17 @@ class Attempts:
         ManagedSystemError
             `error`, with the rule, where the episode is not begun again.
         """
+        last = self.is_last(number)
         self.failures += 1
         self.on_abort(number, str(error))
-        if self.failures > self.retries:
+        if last:
             error.args = (f"{error} {self.rule}",)
             raise error
+
+    def is_last(self, number: int) -> bool:
+        """Whether no other attempt at episode `number` is allowed after the one that is being made."""
+        episode, before = self._before
+        return self.failures + (before if episode == number else 0) >= self.retries
 
     def begun_again(self, number: int, enabled: tuple[int, ...]) -> None:
         """Put another object of the system in the place of the one that has failed, as it was after the last episode.

@@ -97,6 +97,7 @@ class Execute:
         self._seeds = (seed, loop, trial)
         self._max_actions = max_actions
         self.attempts = Attempts(system, retries)
+        self.driving = 0  # the episode that is being driven, as other threads see it
         self._own_signals = system.signal_names
         self.trace: Callable[[int, npt.NDArray[np.float64]], object] | None = None
         self._traced = range(0)
@@ -206,21 +207,26 @@ class Execute:
     def _tried(self, number: int, attempt: Callable[[int], T]) -> T:
         """Return what an attempt at episode `number` gives, or the next one where the system breaks it off."""
         again = False
-        while True:
-            try:
-                if again:
-                    self.attempts.begun_again(number, self._enabled)
-                return attempt(number)
-            except ManagedSystemError as error:
-                self._begun = 0
-                self.attempts.broken_off(number, error)
-                again = True
+        self.driving = number
+        try:
+            while True:
+                try:
+                    if again:
+                        self.attempts.begun_again(number, self._enabled)
+                    return attempt(number)
+                except ManagedSystemError as error:
+                    self._begun = 0
+                    self.attempts.broken_off(number, error)
+                    again = True
+        finally:
+            self.driving = 0
 
     def _attempt(self, number: int) -> tuple[int, dict[str, float]]:
         """Drive episode `number`; return its steps and signals."""
         plan = self.plan
         if plan is None:
             raise PartError("no plan is in force; plan 0 starts a run")
+        self._workspace.forget()
         at = self.uniforms.find(self.passes)
 
         available = self.system.available(number) if self.rules is not None else None
@@ -238,7 +244,6 @@ class Execute:
             self._set_rows(available)
         tracing = number in self._traced
         trace = np.empty((self.system.max_steps, len(episode.TRACE_COLUMNS))) if tracing else self._no_trace
-        self._workspace.forget()
         try:
             status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
         except BaseException as error:
@@ -314,6 +319,11 @@ class Execute:
     def roll_back(self) -> None:
         """Make the Q-table what it was before the last episode."""
         self._workspace.roll_back()
+
+    @property
+    def steps(self) -> int:
+        """Steps of the newest episode that have returned, -1 before its reset has; as other threads see it."""
+        return int(self._workspace.used[1])
 
     @property
     def compiled(self) -> bool:

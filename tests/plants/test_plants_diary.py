@@ -183,8 +183,8 @@ def test_python_makes_a_loop_without_touching_its_system(here):
 def test_reproduce_leaves_a_plant_that_takes_the_place_of_its_system_in_one_piece(here):
     """No plant has the paper's drifts; that is said, and before it is driven."""
     done = subprocess.run(
-        [*MAPEK, "reproduce", "jump", "--set", 'system={id = "pump:PlantPump-v0"}', "--trials", "1", "--set", "episodes=12",
-         "--no-statistics", "--no-figures", "--out", "out", "-q"],
+        [*MAPEK, "reproduce", "jump", "--set", 'system={id = "pump:PlantPump-v0"}', "--trials", "1",
+         "--set", "episodes=12", "--no-statistics", "--no-figures", "--out", "out", "-q"],
         cwd=here, capture_output=True, text=True, timeout=90, check=False,
     )  # fmt: skip
     agents = json.loads((here / "out" / "result.json").read_bytes())["agents"] if done.returncode == 0 else {}
