@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, cast
 
 from adapters.buses.member import Asked, Member
@@ -26,6 +26,9 @@ from mape.loop import build_execute
 from mape.states import faults
 
 logger = logging.getLogger(__name__)
+
+SETTLES_WITHIN = 1.0
+"""Seconds that an Execute of a plant, which is to stop, takes for its last Observation to be acknowledged."""
 
 HEARD_AT_LEAST = 0.002
 """Seconds between two episodes in which plans are put in force, even if the next one is due."""
@@ -76,6 +79,13 @@ class ExecuteRole(Role):
             with ExitStack() as closed:  # all of them, even if one raises
                 for system in self.systems:
                     closed.callback(system.close)
+
+    def leave(self) -> None:
+        """Wait until all is acknowledged; of a plant for a while even if this role is to stop, for it has no other."""
+        if self.stopping.is_set() and not all(system.redrivable for system in self.systems):
+            with suppress(BusError):
+                self.member.settle(SETTLES_WITHIN)
+        super().leave()
 
     def begin(self) -> None:
         """Make each loop's component, and restore it."""

@@ -91,8 +91,12 @@ class Role(Replacing):
                 if self._vetted:
                     self._let_in()
             self._refuse_all()
-            if not self.stopping.is_set():
-                self.member.settle()
+            self.leave()
+
+    def leave(self) -> None:
+        """Wait until all that was sent is acknowledged, unless this role is to stop: then it is sent again."""
+        if not self.stopping.is_set():
+            self.member.settle()
 
     def begin(self) -> None:
         """Make each loop's component, and restore it."""
