@@ -109,6 +109,9 @@ class Link:
     def note(self, *note):
         self.notes.append(note)
 
+    def settle(self):
+        self.notes.append("settled")
+
 
 @pytest.fixture
 def watched():
@@ -116,7 +119,7 @@ def watched():
 
     def make(retries=0, hang_after=3.0):
         one, link, codes = Driven(retries), Link(), []
-        return one, link, codes, pulse.Pulse(link, lambda: {0: one}, hang_after, codes.append)
+        return one, link, codes, pulse.Pulse(lambda: link, lambda: {0: one}, hang_after, codes.append)
 
     return make
 
@@ -136,7 +139,7 @@ def test_no_step_for_long_gives_the_episode_up_and_names_it(watched, capsys):
     for _ in range(4):
         beat.look(1.0)
     assert (link.beats, codes) == (3, [HUNG])
-    assert link.notes == [("aborted", "step 18 of episode 4 did not return within 3 s", 0, 4)]
+    assert link.notes == [("aborted", "step 18 of episode 4 did not return within 3 s", 0, 4), "settled"]
     one.attempts.failures = 1
     beat.look(1.0)
     assert codes == [HUNG, SYSTEM_FAILED]
