@@ -7,11 +7,13 @@ kept.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import os
 import sys
 from collections.abc import Sequence
 
+from adapters.cli.limits import exhausted, obstacle
 from adapters.cli.options import parser
 from adapters.cli.terminal import clean_streams
 
@@ -31,8 +33,20 @@ class OutputError(Exception):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
+    _open_streams()
     with clean_streams():
         return _main(arguments)
+
+
+def _open_streams() -> None:
+    """Put nothing in the place of standard streams that are closed: the next file would take their numbers."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        if getattr(sys, name) is None:
+            with contextlib.suppress(OSError):
+                os.fstat(number)
+                continue  # it is open, and only Python has none
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free, which is this one
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115 - to the end
 
 
 def _main(arguments: Sequence[str] | None) -> int:
@@ -76,6 +90,9 @@ def dispatch(chosen: argparse.Namespace) -> int:
     """Run the command that was chosen; return its exit code."""
     import importlib
 
+    if (said := obstacle(chosen.command)) is not None:
+        print(f"mapek: {said}", file=sys.stderr)
+        return 1
     module = importlib.import_module(f"adapters.cli.{chosen.command}")
     code: int = module.execute(chosen)
     return code
@@ -94,9 +111,15 @@ def _failed(error: Exception) -> int:
         elif notes:  # else the reader has seen enough, as of `mapek list | head`
             print(f"mapek: nobody reads standard output any more.{notes}", file=sys.stderr)
         return 1
+    limit = exhausted(error)
     if not isinstance(error, MapekError):
-        raise error
+        if limit is None:
+            raise error
+        print(f"mapek: {limit}{_notes(error)}", file=sys.stderr)
+        return 1
     print(f"mapek: {error}", file=sys.stderr)
+    if limit is not None:
+        print(f"mapek: {limit}", file=sys.stderr)
     if type(error).__name__ == "Stopped":
         return 130
     return 2 if isinstance(error, ConfigError) else 1

@@ -253,7 +253,14 @@ def _run_in_workers(tasks: list[Task], assemblies: list[tuple[Any, ...]], worker
     before = signal.getsignal(signal.SIGINT)
     waits: threading.Timer | None = None
     try:
-        with _Pool(others, mp_context=context, initializer=_start_worker) as pool:
+        try:
+            made = _Pool(others, mp_context=context, initializer=_start_worker)
+        except OSError as error:
+            raise MapekError(
+                f"no worker process can be started ({error.strerror or error}): they are kept in step by shared memory "
+                "(/dev/shm), and by files. --workers 1 does without"
+            ) from error
+        with made as pool:
             try:
                 for results in each_completed(
                     pool, run_chunk, tasks, in_flight=2 * others, here=functools.partial(run_chunk, lend=lend)
