@@ -253,7 +253,9 @@ class Execute:
                 raise
             if (steps := int(self._workspace.used[1])) < 0:
                 raise self._failed_to_reset(error, number) from error
-            raise broken_off(error, self.system, number, steps + 1) from error
+            # A learner's rules are called for the step that is over, the system's for the next one.
+            step = steps if isinstance(error, PartError) else steps + 1
+            raise broken_off(error, self.system, number, step) from error
         if status != episode.OK:
             self._workspace.roll_back()
             raise refused(status, self.system, number, steps, (total, td_error, change), self.q_table.actions)

@@ -204,6 +204,13 @@ class _PlannerScript:
             raise Broken(f"the plan of loop 3, pass {number} says loop {plan.loop}, pass {plan.pass_no}; hand them on")
         _epsilon(plan.epsilon)
         travels(plan)
+        for name, actions in (("add", plan.add), ("drop", plan.drop), ("enable", plan.enable)):
+            if any(type(action) is not int or action < 0 for action in actions) or len({*actions}) != len(actions):
+                raise Broken(
+                    f"plan {number} cannot be executed: it has {name} = {actions!r}; name each action once, ints from 0"
+                )
+        if not all(map(finite, plan.learning_rate)):
+            raise Broken(f"plan {number} has the learning rate {plan.learning_rate!r}; give finite numbers")
         if unknown := {*plan.drop} - {*self.known, *plan.add}:
             raise Broken(f"plan {number} drops {sorted(unknown)}, which have no row; {self.known} have")
         return plan
