@@ -32,6 +32,11 @@ _CACHE = Path(tempfile.gettempdir(), f"mapek-test-cache-{os.getuid()}")
 _CACHE.mkdir(mode=0o700, exist_ok=True)
 os.environ["MAPEK_CACHE"] = str(_CACHE)
 
+# The tokens of what tests listen on are not among the user's own either.
+_RUNTIME = Path(tempfile.gettempdir(), f"mapek-test-runtime-{os.getuid()}")
+_RUNTIME.mkdir(mode=0o700, exist_ok=True)
+os.environ["XDG_RUNTIME_DIR"] = str(_RUNTIME)
+
 settings.register_profile(
     "mapek",
     deadline=None,  # the first example of a compiled episode may have to compile it

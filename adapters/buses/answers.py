@@ -10,6 +10,7 @@ import zenoh
 
 from adapters.buses.messages import (
     Acknowledged,
+    Control,
     Dropped,
     Happened,
     Join,
@@ -28,6 +29,7 @@ from adapters.stores.sqlite_store import Snapshot, Swap
 from knowledge import STAGES, Ack, MalformedRecord
 from mape.errors import BusError
 from mape.parts import owner
+from mape.specs import PartSpec
 from mape.tables import first_difference
 
 TOLD_BY_ROLES = ("begun", "aborted", "carried", "swap refused")
@@ -45,6 +47,14 @@ class Answer(NamedTuple):
     published: tuple[str, int, bytes] | None = None
 
 
+class Relay(NamedTuple):
+    """A question that is handed on to a role once it is on disk; what the role says answers it."""
+
+    query: zenoh.Query
+    role: str
+    control: Control
+
+
 class Refusal(BusError):
     """An answer that says no, and why; nothing was changed."""
 
@@ -60,6 +70,8 @@ class Answers:
         As `KnowledgeHub` takes them.
     seal
         What Knowledge attaches to all that it publishes; told to who joins.
+    proof
+        Answers the challenge of a role that joins.
     fetch_table
         Asks Execute, in its own time, for the Q-table of a loop's episode, and has the question answered then.
     """
@@ -73,6 +85,7 @@ class Answers:
         versions: Mapping[str, str],
         snapshot_every: int,
         seal: str,
+        proof: Callable[[str, str], str],
         fetch_table: Callable[[zenoh.Query, int, int], object],
     ) -> None:
         self.snapshot_every = snapshot_every
@@ -81,6 +94,7 @@ class Answers:
         self._config = config
         self._versions = versions
         self._seal = seal
+        self._proof = proof
         self._fetch_table = fetch_table
 
     # What roles send.
@@ -134,7 +148,7 @@ class Answers:
 
     # What is asked of Knowledge.
 
-    def asked(self, query: zenoh.Query) -> Answer | None:
+    def asked(self, query: zenoh.Query) -> Answer | Relay | None:
         """Answer what is asked under ``knowledge``; None where the answer comes later.
 
         Raises
@@ -155,6 +169,8 @@ class Answers:
             return self._snapshot(query, role)
         if what == "remember" and role == "plan":
             return self._remember(query)
+        if what == "swap":
+            return self._swap(query)
         if what == "swapped" and role in STAGE_OF:
             return self._swapped(query, role)
         if what == "event" and role in STAGE_OF:
@@ -182,7 +198,8 @@ class Answers:
         self._presence.joins(join)
         layout = self._ledger.layout
         if layout is None:  # who waits for Execute asks again and again, and joins once
-            return Answer(query, Joined(epoch=0, seal="", units=0, layout=None, last=(), swaps=()).pack())
+            proof = self._proof(role, join.challenge)
+            return Answer(query, Joined(epoch=0, seal="", units=0, layout=None, last=(), swaps=(), proof=proof).pack())
         epoch = self._ledger.join(role)
         others = {n: v for n, v in join.versions.items() if self._versions.get(n, v) != v}
         if others:
@@ -196,6 +213,7 @@ class Answers:
         joined = Joined(
             epoch=epoch,
             seal=self._seal,
+            proof=self._proof(role, join.challenge),
             units=self._ledger.units,
             layout=told,
             last=tuple(self._ledger.last(loop) for loop in range(self._ledger.units)),
@@ -256,19 +274,67 @@ class Answers:
             raise MalformedRecord("a Q-table to remember stands behind its message")
         return Answer(query, self._ledger.store.keep_table(table, remembered=True).encode())
 
+    def _swap(self, query: zenoh.Query) -> Relay:
+        control, _ = Control.unpack(_payload(query, LARGEST_MESSAGE))
+        if control.what != "swap" or control.part is None or control.to is None or control.question is None:
+            raise MalformedRecord("who wants a swap names the part, what it is to be, and the question itself")
+        role = owner(control.part)
+        wanted = {"part": control.part, "to": control.to}
+        asked = self._questions()
+        known = asked.get(control.question, {**wanted, "loops": {}, "refused": False})
+        if {name: known[name] for name in wanted} != wanted:
+            raise Refusal(f"the question {control.question} has asked for {known['to']} as {known['part']}; ask anew")
+        self._keep_questions({**asked, control.question: known})
+        return Relay(query, role, control)
+
+    def refused(self, question: str) -> None:
+        """Take note that a role refused what was asked for: no later pass may have it."""
+        asked = self._questions()
+        self._keep_questions({**asked, question: {**asked[question], "refused": True}})
+
+    def _questions(self) -> dict[str, Any]:
+        """Return what operators asked for: question -> part, to, the pass from which each loop has it, refused."""
+        asked: dict[str, Any] = self._ledger.store.facts().get("asked", {})
+        return asked
+
+    def _keep_questions(self, asked: dict[str, Any]) -> None:
+        self._ledger.store.set_facts(asked=asked)
+
     def _swapped(self, query: zenoh.Query, role: str) -> Answer:
         swapped, _ = Swapped.unpack(_payload(query, LARGEST_MESSAGE))
         self._check_epoch(role, _attachment(query))
         loop, number = self._loop(swapped.loop), swapped.pass_no
         if owner(swapped.part) != role:
             raise Refusal(f"{swapped.part} is a part of {owner(swapped.part)}, not of {role}")
-        if not swapped.planned and number <= self._ledger.last(loop)[STAGE_OF[role]]:
+        if swapped.planned:
+            self._check_planned(swapped)
+        elif number <= self._ledger.last(loop)[STAGE_OF[role]]:
             raise Refusal(f"pass {number} has been made with the part before; {swapped.part} is replaced after it")
+        else:
+            self._check_asked_for(swapped)
         self._ledger.swapped(Swap(loop, number, swapped.part, swapped.to, swapped.handed_over, swapped.planned))
         if not swapped.planned:
             text = f"from pass {number} on, {swapped.part} is {json.dumps(swapped.to)}"
             self._ledger.note(role, "swapped", text, loop, number)
         return Answer(query, b"ok")
+
+    def _check_planned(self, swapped: Swapped) -> None:
+        told = {"pass": swapped.pass_no, "part": swapped.part, "to": swapped.to}
+        if self._config is not None and told not in self._config.get("swap", ()):
+            raise Refusal(f"the config plans no swap of {swapped.part} to {swapped.to} at pass {swapped.pass_no}")
+
+    def _check_asked_for(self, swapped: Swapped) -> None:
+        """Hold it against what an operator asked for: what nobody did, no role puts into the log."""
+        asked = self._questions()
+        known = asked.get(swapped.question or "")
+        if known is None or (known["part"], _normal(known["to"])) != (swapped.part, _normal(swapped.to)):
+            raise Refusal(f"nobody asked Knowledge for {swapped.to} as {swapped.part}: an operator does, by mapek swap")
+        loop, begins = str(swapped.loop), known["loops"].get(str(swapped.loop))
+        if known["refused"] or begins not in (None, swapped.pass_no):
+            why = "it was refused" if known["refused"] else f"loop {loop} has it from pass {begins} on"
+            raise Refusal(f"{swapped.part} was asked for once, and {why}; ask anew")
+        loops = {**known["loops"], loop: swapped.pass_no}
+        self._keep_questions({**asked, str(swapped.question): {**known, "loops": loops}})
 
     def _event(self, query: zenoh.Query, role: str) -> Answer:
         happened, _ = Happened.unpack(_payload(query, LARGEST_MESSAGE))
@@ -300,6 +366,12 @@ def _telling_first(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _FOR_PEOPLE = ("name", "description")
+
+
+def _normal(to: dict[str, Any]) -> dict[str, Any]:
+    """Return a part as all write it, whoever left out what is so by default."""
+    normal: dict[str, Any] = PartSpec.model_validate(to).model_dump(mode="json")
+    return normal
 
 
 def _payload(query: zenoh.Query, largest: int) -> bytes:

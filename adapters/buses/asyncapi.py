@@ -67,10 +67,16 @@ def document() -> dict[str, Any]:
         ):  # fmt: skip
             channel(f"{what}-{role}", wire.ask(f"{what}/{role}"), f"query by {role}: {said}", asked, answered)
         channel(
-            f"control-{role}", wire.control(role), f"query, answered by {role}", ("Control",), ("Replaced", "Table")
+            f"control-{role}",
+            wire.control(role),
+            f"query by Knowledge, answered by {role}",
+            ("Control",),
+            ("Replaced", "Table"),
         )
         channel(f"beat-{role}", wire.beat(role), f"published by {role}: its heartbeat", ("Beat",))
         channel(f"alive-{role}", wire.alive(role, "{epoch}"), f"liveliness token of {role}", ())
+    text = "query by an operator: have another part put in; Knowledge hands it on to the role whose part it is"
+    channel("swap", wire.ask("swap"), text, ("Control",), ("Replaced",))
     kinds = tuple(stage.__name__ for stage in STAGES)
     text = "query with ?loop=L;from=STAGE:PASS,...: the number of the loop, then records, one a line"
     channel("since", wire.ask("since"), text, (), kinds)

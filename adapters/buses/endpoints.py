@@ -67,9 +67,9 @@ def check_endpoint(endpoint: str, anywhere: bool) -> None:
         )
     if not anywhere and not _LOOPBACK.fullmatch(found["host"]):
         raise ConfigError(
-            f"endpoint {endpoint!r} can be reached from other machines, and without keys nobody proves who they are. "
+            f"endpoint {endpoint!r} can be reached from other machines, and without keys all that is sent can be read. "
             "Make keys with `mapek keys DIR` and give --tls DIR; or stay on 127.0.0.1; or, where the network itself is "
-            "trusted, give --insecure"
+            "trusted, give --insecure, and the run's token on each machine, --token FILE"
         )
 
 

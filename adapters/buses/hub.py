@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import zenoh
 
-from adapters.buses.answers import Answer, Answers
+from adapters.buses.answers import Answer, Answers, Relay
 from adapters.buses.messages import (
     Control,
     Table,
@@ -37,6 +37,10 @@ AT_ONCE = 1024
 
 TABLE_WITHIN = 5.0
 """Seconds that Execute has to hand out a Q-table."""
+
+
+SWAPPED_WITHIN = 60.0
+"""Seconds that a role has to check a part that is asked for, and to reach the end of its pass."""
 
 
 class KnowledgeHub:
@@ -93,6 +97,7 @@ class KnowledgeHub:
             versions=dict(versions or {}),
             snapshot_every=snapshot_every,
             seal=self._seal,
+            proof=wire.proof,
             fetch_table=self._fetch_table,
         )
         self._leave: Callable[..., object] | None = None
@@ -159,7 +164,7 @@ class KnowledgeHub:
     def _work(self) -> None:
         asked = self._asked.get()
         while asked is not None:
-            answers: list[Answer] = []
+            answers: list[Answer | Relay] = []
             try:
                 try:
                     for _ in range(AT_ONCE):
@@ -174,7 +179,11 @@ class KnowledgeHub:
                 self._fail(error, asked, answers)
                 return
             for answer in answers:
-                self._say(answer)
+                if isinstance(answer, Relay):
+                    # The role may take as long as the checks of a part do.
+                    threading.Thread(target=self._relay, args=(answer,), daemon=True).start()
+                else:
+                    self._say(answer)
             if self.ledger.complete:
                 self.ended.set()
                 if self.presence.all_came_and_went:
@@ -182,7 +191,7 @@ class KnowledgeHub:
             if asked == ("", None):
                 asked = self._asked.get()
 
-    def _fail(self, error: ResultsError, asked: tuple[str, Any] | None, answers: list[Answer]) -> None:
+    def _fail(self, error: ResultsError, asked: tuple[str, Any] | None, answers: list[Answer | Relay]) -> None:
         # The logs in memory are ahead of the disk: nothing more can be said that would be true. Who asked is told
         # nothing, and waits for the next Knowledge, as it would if this one had been killed.
         self.failure = error
@@ -204,7 +213,7 @@ class KnowledgeHub:
             _, _, rest = str(answer.query.key_expr).split("/", 2)
             answer.query.reply(f"mape/{self.wire.system}/{rest}", answer.payload)
 
-    def _hear(self, kind: str, what: Any, answers: list[Answer]) -> None:
+    def _hear(self, kind: str, what: Any, answers: list[Answer | Relay]) -> None:
         try:
             if kind == "beat":
                 self.presence.beats(what)
@@ -214,6 +223,8 @@ class KnowledgeHub:
                 query, number, loop, table = what
                 self.ledger.store.keep_version(loop, number, table)
                 answers.append(Answer(query, Table(loop=loop, pass_no=number).pack(table)))
+            elif kind == "swap refused":
+                self.answers.refused(what)
             elif kind:
                 answer = self.answers.append(what) if kind == "append" else self.answers.asked(what)
                 if answer is not None:
@@ -239,6 +250,26 @@ class KnowledgeHub:
         self.presence.refused(role)
         self.ledger.note(role[:64], "refused", said[:500])
 
+    def _relay(self, relay: Relay) -> None:
+        """Hand an operator's question on, and the role's answer back; without one the operator asks again."""
+        query, role, control = relay
+        assert self._session is not None
+        with suppress(zenoh.ZError), query:
+            for reply in self._session.get(
+                self.wire.control(role),
+                payload=control.pack(),
+                attachment=self._seal,
+                timeout=SWAPPED_WITHIN,
+                **ORDERED,
+            ):
+                if reply.ok is not None:
+                    query.reply(self.wire.ask("swap"), reply.ok.payload)
+                    return
+                if reply.err is not None and (said := reply.err.payload.to_string()) != "Timeout":
+                    self._asked.put(("swap refused", control.question))
+                    query.reply_err(said)
+                    return
+
     def _fetch_table(self, query: zenoh.Query, loop: int, number: int) -> None:
         # Execute may itself be waiting for the worker.
         threading.Thread(target=self._ask_execute, args=(query, loop, number), daemon=True).start()
@@ -248,7 +279,9 @@ class KnowledgeHub:
         control = Control(what="q_table", loop=loop, pass_no=number).pack()
         assert self._session is not None
         with suppress(zenoh.ZError):
-            for reply in self._session.get(self.wire.control("execute"), payload=control, timeout=TABLE_WITHIN):
+            for reply in self._session.get(
+                self.wire.control("execute"), payload=control, attachment=self._seal, timeout=TABLE_WITHIN
+            ):
                 if reply.ok is None:
                     said = reply.err.payload.to_string() if reply.err is not None else said
                     continue

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hmac
 import json
 import logging
 import os
+import secrets
 import threading
 import time
 import weakref
@@ -165,14 +167,21 @@ class Member(Questions):
                 self._say(f"waiting for Knowledge on {self.wire.endpoint}{why}")
 
     def _join(self, deadline: float | None) -> None:
+        challenge = secrets.token_hex(16)
         join = Join(
             role=self.role, config=self._config, versions=self._versions, pid=os.getpid(), host=host(),
-            layout=self._layout,
+            layout=self._layout, challenge=challenge,
         ).pack()  # fmt: skip
         pause = threading.Event()
         while True:
             # One of another system is asked too: it refuses this role, and says what differs.
-            self.joined, _ = Joined.unpack(self.ask(f"join/{self.role}", join, deadline=deadline, any_system=True))
+            joined, _ = Joined.unpack(self.ask(f"join/{self.role}", join, deadline=deadline, any_system=True))
+            if not hmac.compare_digest(joined.proof, self.wire.proof(self.role, challenge)):
+                raise Refused(
+                    f"who answers {self.role} on {self.wire.endpoint} has not the run's token, and is no Knowledge of "
+                    "yours. Look who listens there, and give the run another endpoint"
+                )
+            self.joined = joined
             if self.joined.layout is not None:
                 break
             if deadline is not None and time.monotonic() > deadline:
@@ -356,6 +365,9 @@ class Member(Questions):
 
     def _questioned(self, query: zenoh.Query) -> None:
         try:
+            seal = query.attachment
+            if seal is None or seal.to_bytes() != self._inbox.seal:
+                raise MalformedRecord(f"{self.role} is asked by Knowledge alone; ask that")
             payload = query.payload
             if payload is None or len(payload) > LARGEST_MESSAGE:
                 raise MalformedRecord(f"a question to {self.role} carries a Control message")

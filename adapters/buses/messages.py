@@ -85,7 +85,10 @@ class Layout(Message):
 
 
 class Join(Message):
-    """A role introduces itself. Who has another config or other versions is refused."""
+    """A role introduces itself. Who has another config or other versions is refused.
+
+    `challenge` is what Knowledge is to answer, to show that it has the run's token.
+    """
 
     role: Name
     config: dict[str, Any]
@@ -93,10 +96,14 @@ class Join(Message):
     pid: Number
     host: Annotated[str, Field(max_length=255)]
     layout: Layout | None
+    challenge: Annotated[str, Field(max_length=64)] = ""
 
 
 class Swapped(Message):
-    """From pass `pass_no` on, `part` of a loop is another one; also how a role is told of it when it joins."""
+    """From pass `pass_no` on, `part` of a loop is another one; also how a role is told of it when it joins.
+
+    Either the config has `planned` it, or it answers the `question` that Knowledge handed on.
+    """
 
     loop: Number
     pass_no: Number
@@ -104,6 +111,7 @@ class Swapped(Message):
     to: dict[str, Any]
     handed_over: bool = False
     planned: bool = False
+    question: Name | None = None
 
 
 class Joined(Message):
@@ -111,7 +119,8 @@ class Joined(Message):
 
     Attributes
     ----------
-    seal : what Knowledge attaches to all that it publishes.
+    seal : what Knowledge attaches to all that it publishes, and to what it asks a role.
+    proof : that it has the run's token, see `Wire.proof`; empty with keys.
     last : per loop, the number of the last record of each stage; -1 where there is no plan 0.
     begun : per loop, the last episode that was begun and not broken off since, of systems that cannot be driven again.
     failed : per loop, how many attempts at its next episode were broken off.
@@ -124,6 +133,7 @@ class Joined(Message):
     layout: Layout | None
     last: tuple[tuple[int, int, int, int], ...]
     swaps: tuple[Swapped, ...]
+    proof: str = ""
     begun: tuple[int, ...] = ()
     failed: tuple[int, ...] = ()
     snapshot_every: Annotated[int, Field(ge=1)] = 100
@@ -181,6 +191,8 @@ class Beat(Message):
 
 class Control(Message):
     """A question to a role: replace a part by another (`part`, `to`), or hand out the Q-table of an episode.
+
+    Roles are asked by Knowledge alone. It keeps who of the operators wants which part, and hands the question on.
 
     One whose answer was lost is asked again with the same `question`, any text of its own, and is not answered anew.
     """

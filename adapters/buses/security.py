@@ -1,4 +1,4 @@
-"""Who may say what on the wire: mutual TLS says who somebody is, an access-control list what that role may do.
+"""Who may say what on the wire: keys or a token say who somebody is, an access-control list what that role may do.
 
 Knowledge is the router that all others connect to, so its list is the only one there is. `RIGHTS` is that list as
 people read it; whatever is not in it is denied. Knowledge's own session is the router's, and no list holds for it.
@@ -58,7 +58,7 @@ RIGHTS = (
     Right("query", "mape/*/knowledge/since", CLIENTS),
     Right("query", "mape/*/knowledge/table", ("plan", "execute", OPERATOR)),
     Right("query", "mape/*/knowledge/status", CLIENTS),
-    Right("query", "mape/*/control/*", (OPERATOR,)),
+    Right("query", "mape/*/knowledge/swap", (OPERATOR,)),
     Right("answer", "mape/*/control/{role}", STAGES),
     Right("publish", "mape/*/knowledge/beat/{role}", STAGES),
     Right("be seen", "mape/*/alive/{role}/*", STAGES),
@@ -81,8 +81,10 @@ _MESSAGES: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 _TOLD = ("declare_subscriber", "declare_queryable")
 
 
-def access_control() -> dict[str, Any]:
+def access_control(proven_by: str = "cert_common_names") -> dict[str, Any]:
     """Return Knowledge's ``access_control`` for Zenoh's config: `RIGHTS`, and else nothing.
+
+    A role is known by the common name of its certificate, or, with a token, by its user name: ``usernames``.
 
     Nothing is ever denied by a rule, only by default: a rule holds for the keys that its own key includes, so a
     wildcard that reaches beyond it slips past a rule that denies, and is not let through by a rule that allows.
@@ -92,7 +94,7 @@ def access_control() -> dict[str, Any]:
         "enabled": True,
         "default_permission": "deny",
         "rules": [rule for of_role in rules.values() for rule in of_role],
-        "subjects": [{"id": role, "cert_common_names": [role]} for role in CLIENTS],
+        "subjects": [{"id": role, proven_by: [role]} for role in CLIENTS],
         "policies": [
             {"rules": [rule["id"] for rule in of_role], "subjects": [role]} for role, of_role in rules.items()
         ],
@@ -104,8 +106,7 @@ def _rules(role: str) -> list[dict[str, Any]]:
     for verb, flows in _MESSAGES.items():
         keys = [right.key for right in RIGHTS if right.verb == verb and role in right.roles]
         for flow, messages in flows.items():
-            # What is handed out answers what was taken in, and was held against the role's own name then. An operator's
-            # query to all of `control/*` stays one key on its way to each.
+            # What is handed out answers what was taken in, and was held against the role's own name then.
             name = role if flow == "ingress" else "*"
             if keys:
                 rules.append(_rule(role, verb, flow, messages, [key.format(role=name) for key in keys]))

@@ -5,12 +5,13 @@
     mape/<system>/knowledge/join/<role>          query: I am <role>, with this config; what is my epoch?
     mape/<system>/knowledge/since                query: the records of a loop from a pass on
     mape/<system>/knowledge/snapshot/<role>      query: keep my state; or, without a payload, give it back
-    mape/<system>/knowledge/swapped/<role>       query: from this pass on I work with another part
+    mape/<system>/knowledge/swap                 query: have another part put in; handed on to the role whose part it is
+    mape/<system>/knowledge/swapped/<role>       query: from this pass on I work with the part that was asked for
     mape/<system>/knowledge/event/<role>         query: note this beside the records
     mape/<system>/knowledge/table                query: a Q-table, by its hash or by the pass at whose end it was
     mape/<system>/knowledge/remember/plan        query: keep this Q-table for a later plan
     mape/<system>/knowledge/status               query: who is there, and how far is the run?
-    mape/<system>/control/<role>                 query: answered by the role itself; replaces a part, hands out Q
+    mape/<system>/control/<role>                 query by Knowledge, answered by the role: replace a part, hand out Q
     mape/<system>/knowledge/beat/<role>          heartbeat of the thread that does the role's work
     mape/<system>/alive/<role>/<epoch>           liveliness token, declared last
 
@@ -20,6 +21,7 @@ The roles stand in `adapters.roles`. Knowledge is the router; `operator` is a pe
 from __future__ import annotations
 
 import ctypes
+import hmac
 import json
 import os
 import re
@@ -34,13 +36,13 @@ from typing import Any
 
 import zenoh
 
-from adapters.buses import endpoints, security
+from adapters.buses import endpoints, security, tokens
 from adapters.buses.round_trip import RoundTrip
 from adapters.roles import KNOWLEDGE, OPERATOR, ROLES
 from knowledge import STAGES, ChangePlan, ChangeRequest, Observation, Record, Symptom
 from mape.errors import BusError, ConfigError
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2
 """Version of the keys and messages; processes of different ones refuse each other."""
 
 INPUT: dict[str, type[Record]] = {
@@ -112,9 +114,12 @@ class Wire:
     tls
         Folder with certificates, as `mapek keys` makes it: both ends then prove who they are.
     insecure
-        Allow hosts beyond this one without certificates.
+        Allow hosts beyond this one without certificates: what is sent can then be read on the way.
     patience
         Seconds for which an answer may be waited for, at most, before it is asked for again.
+    token
+        File of the run's token, by which both ends prove who they are where there are no certificates; None for the one
+        in the user's runtime folder, under the endpoint's name.
 
     Raises
     ------
@@ -133,6 +138,7 @@ class Wire:
     tls: Path | None = None
     insecure: bool = False
     patience: float = PATIENCE
+    token: Path | None = None
 
     def __post_init__(self) -> None:
         if self.system != "*":
@@ -140,6 +146,8 @@ class Wire:
         endpoints.check_endpoint(self.endpoint, self.tls is not None or self.insecure)
         if self.tls is not None and self.endpoint.startswith(endpoints.UNIX):
             raise ConfigError(f"endpoint {self.endpoint!r} takes no keys; with --tls give tcp/HOST:PORT")
+        if self.tls is not None and self.token is not None:
+            raise ConfigError("with keys everybody proves who they are, and needs no token; leave out --tls or --token")
 
     @property
     def lease(self) -> float:
@@ -177,18 +185,21 @@ class Wire:
         return f"mape/{self.system}/alive/{role}/{epoch}"
 
     def check_listen(self) -> None:
-        """Look whether `listen` would find its endpoint free and its keys in place.
+        """Look whether `listen` would find its endpoint free and its keys in place; make the run's token.
 
         Raises
         ------
         BusError
             The endpoint is taken, or cannot be made.
         ConfigError
-            A certificate is missing, or of no use; or a file that is no socket stands at the endpoint's path.
+            A certificate is missing, or of no use; the token cannot be made, or is not the user's alone; or a file that
+            is no socket stands at the endpoint's path.
         """
         if self.tls is not None:
             security.tls(self.tls, KNOWLEDGE)
         endpoints.check_free(self.endpoint)
+        if self.tls is None:
+            tokens.make(self.endpoint, security.CLIENTS, self.token)
 
     def check_here(self) -> None:
         """Look whether all processes of a run can meet on this machine: `check_listen`, and the others' keys.
@@ -219,6 +230,8 @@ class Wire:
         if self.tls is not None:
             edges["access_control"] = security.access_control()
             security.log_refusals()
+        else:
+            edges["access_control"] = security.access_control("usernames")
         taken = f"cannot listen on {self.endpoint}; is another Knowledge running there?"
         router = _open(self._config("router", KNOWLEDGE, **edges), lambda said: BusError(f"{taken} ({said})"))
         return never_freed(router)
@@ -242,10 +255,25 @@ class Wire:
             "exit_on_failure": True,
             "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
         }
-        return _open(
-            self._config("client", role, connect=connect),
-            lambda said: self._unanswered(endpoint, role, said, patience),
-        )
+        try:
+            config = self._config("client", role, connect=connect)
+        except tokens.NoToken as error:
+            unanswered = self._unanswered(endpoint, role, str(error), patience)
+            raise Unanswered(str(unanswered), unanswered.found and unanswered.found._replace(slow=False)) from error
+        return _open(config, lambda said: self._unanswered(endpoint, role, said, patience))
+
+    def proof(self, role: str, challenge: str) -> str:
+        """Return what shows a role that Knowledge has the token too; empty with keys, which have shown it.
+
+        Parameters
+        ----------
+        role, challenge
+            Who wants to see it, and what it has thought of to be answered.
+        """
+        if self.tls is not None:
+            return ""
+        key = tokens.secret(tokens.find(self.endpoint, self.token), role)
+        return hmac.digest(key.encode(), f"Knowledge has the token of {role}: {challenge}".encode(), "sha256").hex()
 
     def join_patiently(self, role: str, least: float) -> zenoh.Session:
         """Open a client's session as `join` does; while only a slow network is in the way, again, with more time.
@@ -270,6 +298,8 @@ class Wire:
             authority = None if self.tls is None else security.authority_of(self.tls)
             found = endpoints.who_listens(place, authority, patience)
         why = found.why if found else "start it, or look at the address"
+        if self.tls is None and found:
+            why += ", or has another token"
         if self.tls is not None and not found:
             why += f" and at whether it trusts the certificate of {role} in {self.tls}"
         return Unanswered(f"no Knowledge answers on {self.endpoint}; {why} ({said})", found)
@@ -286,8 +316,16 @@ class Wire:
         blocked = {"congestion_control": {"block": {"wait_before_close": (most if far else lease) * 1000}}}
         link: dict[str, Any] = {"tx": {"lease": lease, "queue": blocked}}
         handshakes = {"open_timeout": most, "accept_timeout": most, "accept_pending": PENDING}
+        transport: dict[str, Any] = {"shared_memory": quiet, "unicast": handshakes, "link": link}
         if self.tls is not None:
             link |= security.tls(self.tls, role)
+        else:
+            path = tokens.find(self.endpoint, self.token)
+            if mode == "router":
+                proves = {"dictionary_file": str(path.absolute())}
+            else:
+                proves = {"user": role, "password": tokens.secret(path, role)}
+            transport["auth"] = {"usrpwd": proves}
         return zenoh.Config.from_json5(
             json.dumps(
                 {
@@ -296,7 +334,7 @@ class Wire:
                     # would wait half a second for what may answer.
                     "scouting": {"delay": 0, "multicast": quiet, "gossip": quiet},
                     # Shared memory outlives a killed process, and records are far below the size at which it pays.
-                    "transport": {"shared_memory": quiet, "unicast": handshakes, "link": link},
+                    "transport": transport,
                     # No clock enters what is logged.
                     "timestamping": quiet,
                     **edges,

@@ -13,7 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adapters.cli.main import OutputError
 from adapters.experiments.runner import Checked, announce_compilation, check
@@ -28,6 +28,9 @@ from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
 from mape.parts import cautions
 from mape.tables import parse_override
+
+if TYPE_CHECKING:
+    from adapters.buses.wire import Wire  # and with it Zenoh, which most commands do without
 
 
 def prepare() -> None:
@@ -109,6 +112,20 @@ def _looked_at(chosen: argparse.Namespace, trace: tuple[int, int] | None) -> str
     return ""
 
 
+def wire_of(chosen: argparse.Namespace, endpoint: str, system: str) -> Wire:
+    """Return where a run's processes meet, with what the command line says of who may come.
+
+    Raises
+    ------
+    ConfigError
+        The endpoint is none, or takes no keys, or has none and would be open to other machines.
+    """
+    from adapters.buses.wire import Wire
+
+    tls, token = (None if path is None else Path(path) for path in (chosen.tls, chosen.token))
+    return Wire(endpoint, system, tls, chosen.insecure, chosen.patience, token)
+
+
 @contextlib.contextmanager
 def operator(chosen: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     """Join a run as a person who looks on; yield the session and the wire.
@@ -118,9 +135,7 @@ def operator(chosen: argparse.Namespace) -> Iterator[tuple[Any, Any]]:
     BusError
         Nobody listens there.
     """
-    from adapters.buses.wire import Wire
-
-    wire = Wire(chosen.connect, "*", None if chosen.tls is None else Path(chosen.tls), chosen.insecure, chosen.patience)
+    wire = wire_of(chosen, chosen.connect, "*")
     session = wire.join_patiently("operator", 3.0)
     try:
         yield session, wire

@@ -341,7 +341,16 @@ def _secure(command: argparse.ArgumentParser) -> None:
         "--tls", metavar="DIR", help="keys as `mapek keys DIR` makes them: everybody proves who they are"
     )
     command.add_argument(
-        "--insecure", action="store_true", help="allow other machines without keys, where the network is trusted"
+        "--token",
+        metavar="FILE",
+        help="where there are no keys: the run's token, for another user or machine than Knowledge's; Knowledge makes "
+        "it, and by default it stands in the user's runtime folder, where the others find it",
+    )
+    command.add_argument(
+        "--insecure",
+        action="store_true",
+        help="allow other machines without keys, where the network is trusted: nobody joins without the token, but "
+        "whoever is on the way can read and change what is sent",
     )
 
 

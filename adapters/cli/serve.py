@@ -11,7 +11,7 @@ from pathlib import Path
 
 from adapters.buses.endpoints import folder_of
 from adapters.buses.wire import Wire, system_segment
-from adapters.cli.common import config_of, open_folder, prepare
+from adapters.cli.common import config_of, open_folder, prepare, wire_of
 from adapters.cli.terminal import Clean
 from adapters.processes.serve import (
     Terminated,
@@ -60,9 +60,8 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
             f"--hang-after {chosen.hang_after:g} is of role execute, which ends itself where its system makes no step "
             f"for so long; {chosen.role} has no system"
         )
-    tls = None if chosen.tls is None else Path(chosen.tls)
-    wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure, chosen.patience)
-    if tls is not None:
+    wire = wire_of(chosen, endpoint, system_segment(config.system.id))
+    if wire.tls is not None:
         _keep_standard_output()
     if not knowledge:
         serve_role(config, chosen.role, wire, released, chosen.hang_after)

@@ -12,11 +12,11 @@ from typing import Any
 import zenoh
 from pydantic import ValidationError
 
+from adapters.buses.hub import SWAPPED_WITHIN
 from adapters.buses.messages import Control, Replaced
 from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import Wire
 from adapters.cli.common import operator
-from adapters.processes.replacing import CHECKED_WITHIN
 from adapters.processes.supervise import ask_status
 from mape import registry
 from mape.config import DetectorSpec, PlannerSpec
@@ -24,9 +24,6 @@ from mape.errors import BusError, ConfigError, MapekError
 from mape.parts import kind_of, owner
 from mape.specs import PartSpec, explain
 from mape.tables import refuse_infinity
-
-ANSWERED_WITHIN = CHECKED_WITHIN + 15.0
-"""Seconds that a role has to check the part and to reach the end of its pass."""
 
 THERE_WITHIN = 15.0
 """Seconds that a role has to be there: it may just be started again, or its link be about to come back."""
@@ -67,11 +64,11 @@ def _look_at(part: str, to: dict[str, Any]) -> None:
 
 
 def _ask(role: str, control: Control, session: zenoh.Session, wire: Wire) -> zenoh.Reply:
-    """Ask a role until it has answered: with a link that is lost, question and answer are too.
+    """Ask, by way of Knowledge, until the role has answered: with a link that is lost, question and answer are too.
 
     Only the process that may have heard the question knows it again; another one would make the swap twice.
     """
-    deadline = time.monotonic() + ANSWERED_WITHIN
+    deadline = time.monotonic() + SWAPPED_WITHIN
     heard_by = None
     while (left := deadline - time.monotonic()) > 0 and (epoch := _epoch(role, session, wire)) is not None:
         if heard_by not in (None, epoch):
@@ -80,7 +77,7 @@ def _ask(role: str, control: Control, session: zenoh.Session, wire: Wire) -> zen
                 "`mapek log DIR --events` tells"
             )
         heard_by = epoch
-        for reply in session.get(wire.control(role), payload=control.pack(), timeout=left):
+        for reply in session.get(wire.ask("swap"), payload=control.pack(), timeout=left):
             if reply.ok is not None or _refusal(reply) != "Timeout":
                 return reply
         time.sleep(LOOK_EVERY)  # a role that has just died counts as there for a moment

@@ -11,9 +11,10 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from adapters.buses import tokens
 from adapters.buses.endpoints import check_endpoint
 from adapters.buses.wire import Wire, system_segment
-from adapters.cli.common import config_of, finish, open_folder, prepare, say
+from adapters.cli.common import config_of, finish, open_folder, prepare, say, wire_of
 from adapters.cli.run import as_json, report
 from adapters.cli.sentences import sentence
 from adapters.cli.terminal import cleaned
@@ -55,8 +56,7 @@ def _run(chosen: argparse.Namespace) -> int:
                 "on the network they do, such as --listen tcp/127.0.0.1:7447"
             )
         endpoint = chosen.listen or _own_endpoint(opened)
-        tls = None if chosen.tls is None else Path(chosen.tls)
-        wire = Wire(endpoint, system_segment(config.system.id), tls, chosen.insecure)
+        wire = wire_of(chosen, endpoint, system_segment(config.system.id))
         wire.check_here()
         folder = opened.enter_context(open_folder(chosen, "up", config.name, {label: config}, check=_check))
         try:
@@ -106,6 +106,7 @@ def _own_endpoint(opened: contextlib.ExitStack) -> str:
         endpoint = f"unixsock-stream/{folder}/k.sock"
         with contextlib.suppress(ConfigError):
             check_endpoint(endpoint, anywhere=False)
+            opened.callback(tokens.forget, endpoint)
             return endpoint
     raise ConfigError(f"no socket can be made in {folder}; say where the processes meet: --listen tcp/127.0.0.1:7447")
 
@@ -130,7 +131,11 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         if ledger.complete:
             return  # only its tables are still to be made
     path = folder.path / f"config-{label}.json"
-    shared = [*(["--tls", str(wire.tls)] if wire.tls else []), *(["--insecure"] if wire.insecure else [])]
+    shared = [
+        *(["--tls", str(wire.tls)] if wire.tls else []),
+        *(["--token", str(wire.token)] if wire.token else []),
+        *(["--insecure"] if wire.insecure else []),
+    ]
     kept = ["--durability", chosen.durability, "--snapshot-every", str(chosen.snapshot_every)]
     commands = {
         KNOWLEDGE: command_of(

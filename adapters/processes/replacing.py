@@ -110,12 +110,13 @@ class Replacing(ABC):
             if due.planned:
                 self._record(unit, due, handed_over)
 
-    def _record(self, unit: Unit, due: Due, handed_over: bool) -> None:
+    def _record(self, unit: Unit, due: Due, handed_over: bool, question: str | None = None) -> None:
         number, part, spec, planned = due
-        to = spec.model_dump(mode="json")
-        self.member.swapped(
-            Swapped(loop=unit.loop, pass_no=number, part=part, to=to, handed_over=handed_over, planned=planned)
-        )
+        swapped = Swapped(
+            loop=unit.loop, pass_no=number, part=part, to=spec.model_dump(mode="json"), handed_over=handed_over,
+            planned=planned, question=question,
+        )  # fmt: skip
+        self.member.swapped(swapped)
 
     def _replace(self, unit: Unit, part: str, spec: PartSpec) -> bool:
         assert self.member.joined.layout is not None
@@ -274,7 +275,8 @@ class Replacing(ABC):
 
     def _took(self, unit: Unit, wanted: Wanted, number: int, handed_over: bool) -> None:
         # Kept before the first record that the new part has made: whoever does this pass again does it with the part.
-        self._record(unit, Due(number, wanted.part, wanted.spec, planned=False), handed_over)
+        due = Due(number, wanted.part, wanted.spec, planned=False)
+        self._record(unit, due, handed_over, wanted.asked.control.question)
         wanted.passes[unit.loop] = number
         wanted.handed_over = wanted.handed_over and handed_over
         if len(wanted.passes) == wanted.units:

@@ -9,11 +9,12 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import zenoh
 from bus_records import MAKERS, TOLD, new_ledger
 
 from adapters.buses import KnowledgeHub, Member
 from adapters.buses.member import Asked
-from adapters.buses.messages import Join, Status
+from adapters.buses.messages import Control, Join, Status
 from adapters.buses.wire import INPUT, ORDERED, role_of
 from adapters.roles import ROLES
 
@@ -86,6 +87,13 @@ def ask(session, selector, payload=None, attachment=None):
     """Return (reply, error reply) of the one answer that comes."""
     (answer,) = session.get(selector, payload=payload, attachment=attachment, timeout=60, **ORDERED)
     return (answer.ok.payload.to_bytes(), None) if answer.ok else (None, answer.err.payload.to_string())
+
+
+def want(session, wire, part, to, question):
+    """Ask for a swap as an operator does, and see that Knowledge has heard it; the role's answer is not waited for."""
+    control = Control(what="swap", part=part, to=to, question=question).pack()
+    session.get(wire.ask("swap"), zenoh.handlers.Callback(lambda reply: None), payload=control, timeout=60, **ORDERED)
+    status(session, wire)
 
 
 def status(session, wire):

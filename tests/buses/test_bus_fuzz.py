@@ -212,7 +212,7 @@ def throw_at(target, draw):
         key = draw.choice(["since", "table", "status", f"snapshot/{role}"])
         return "read", wire.ask(key) + draw.choice(SELECTORS), None, attachment
     if kind == "control":
-        return "control", wire.control(role), piece(draw), None
+        return "control", wire.control(role), piece(draw), draw.choice([None, target.hub._seal])
     key = wire.stream(role, loop) if kind == "stream" else wire.beat(draw.choice([*ROLES, "nobody"]))
     return "put", key, piece(draw), attachment
 
@@ -267,7 +267,7 @@ def test_any_bytes_on_the_other_keys_are_refused(lasting, role, payload, attachm
         [
             ("append", wire.append(role, 0), payload, attachment),
             ("append", wire.append(role, 0), payload, b"1"),
-            ("control", wire.control(role), payload, None),
+            ("control", wire.control(role), payload, lasting.hub._seal),
             ("put", wire.stream(role, 0), payload, attachment),
             ("put", wire.beat(role), payload, attachment),
         ]

@@ -221,7 +221,7 @@ def test_a_malformed_question_to_a_role_is_refused_and_counted(site, all_four, p
     server = threading.Thread(target=serve_questions, args=(reader, pytest.fail, stop))
     server.start()
     try:
-        reply, error = ask(asking, site.wire.control("monitor"), payload)
+        reply, error = ask(asking, site.wire.control("monitor"), payload, site.hub._seal)
     finally:
         stop.set()
         server.join(60)
@@ -230,10 +230,27 @@ def test_a_malformed_question_to_a_role_is_refused_and_counted(site, all_four, p
     assert reader.refused == 1
 
 
+@pytest.mark.parametrize("seal", [None, b"", b"another"])
+def test_a_question_that_does_not_come_from_knowledge_is_refused(site, all_four, seal):
+    reader, stop = all_four["plan"], threading.Event()
+    server = threading.Thread(target=serve_questions, args=(reader, pytest.fail, stop))
+    server.start()
+    try:
+        payload = Control(what="swap", part="plan", to={"name": "q_learning"}).pack()
+        reply, error = ask(site.session(), site.wire.control("plan"), payload, seal)
+    finally:
+        stop.set()
+        server.join(60)
+    assert reply is None
+    assert "asked by Knowledge alone" in error
+    assert reader.refused == 1
+
+
 def test_a_question_to_a_role_comes_between_its_records(site, all_four):
     asking = site.session()
     site.send(plan(0))
-    question = asking.get(site.wire.control("execute"), payload=Control(what="q_table", loop=0, pass_no=0).pack())
+    payload = Control(what="q_table", loop=0, pass_no=0).pack()
+    question = asking.get(site.wire.control("execute"), payload=payload, attachment=site.hub._seal)
     got = []
     eventually(lambda: got.append(all_four["execute"].receive(0.01)) or isinstance(got[-1], Asked))
     assert got[-1].control == Control(what="q_table", loop=0, pass_no=0)

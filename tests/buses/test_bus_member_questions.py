@@ -3,7 +3,7 @@
 import threading
 
 import pytest
-from bus_peers import eventually, serve_questions
+from bus_peers import eventually, serve_questions, want
 from bus_records import observation, plan, run_of
 
 from adapters.buses.messages import Control, State, Swapped, Table
@@ -106,11 +106,14 @@ def test_a_table_is_asked_for_again_while_execute_is_away(site):
 
 
 def test_a_swap_is_told_to_who_joins_next(site, all_four):
-    swap = Swapped(loop=0, pass_no=4, part="plan", to={"name": "constant", "epsilon": 0.5}, handed_over=True)
+    to = {"name": "constant", "epsilon": 0.5}
+    want(site.session(), site.wire, "plan", to, "q")
+    swap = Swapped(loop=0, pass_no=4, part="plan", to=to, handed_over=True, question="q")
     all_four["plan"].swapped(swap)
     all_four["plan"].swapped(swap.model_copy(update={"pass_no": 9, "planned": True}))
     # What the config has planned each role knows by itself.
-    assert site.member("plan").joined.swaps == (swap.model_copy(update={"handed_over": False}),)
+    told = swap.model_copy(update={"handed_over": False, "question": None})
+    assert site.member("plan").joined.swaps == (told,)
     site.hub.close()
     assert [(s.pass_no, s.planned, s.handed_over) for s in site.ledger.store.swaps()] == [
         (4, False, True),

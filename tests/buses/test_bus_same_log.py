@@ -67,7 +67,8 @@ def test_a_question_about_a_loop_that_is_not_there_does_not_stop_execute(wire, t
         eventually(lambda: site.ledger.epoch("execute") == 1, within=60)
         with wire.join("operator", 5) as raw:
             control = Control(what="q_table", loop=99, pass_no=1).pack()
-            eventually(lambda: answers.extend(raw.get(wire.control("execute"), payload=control)) or answers, within=60)
+            asked = {"payload": control, "attachment": site.hub._seal}
+            eventually(lambda: answers.extend(raw.get(wire.control("execute"), **asked)) or answers, within=60)
 
     _, (digest,), _ = run_over(wire, tmp_path / "l", config, question)
     assert "loop 99; this run has loops 0 to 0" in answers[0].err.payload.to_string()

@@ -3,7 +3,7 @@
 import pytest
 from command_line import Mapek
 
-from adapters.cli.swap import ANSWERED_WITHIN
+from adapters.cli.swap import SWAPPED_WITHIN
 from adapters.processes.replacing import CHECKED_WITHIN
 
 
@@ -17,4 +17,4 @@ def test_a_part_without_a_name_is_a_matter_of_usage(mapek: Mapek, to: str) -> No
 
 
 def test_who_asks_waits_longer_than_a_check_may_take() -> None:
-    assert ANSWERED_WITHIN > CHECKED_WITHIN
+    assert SWAPPED_WITHIN > CHECKED_WITHIN

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import uuid
 from contextlib import ExitStack
 
 from bus_small_loop import Distributed, small_config
@@ -106,8 +107,8 @@ class Roles(Distributed):
 
     def ask_for(self, part, to, role):
         """Ask a role for another part; return what gives the answer once it is there."""
-        payload = Control(what="swap", part=part, to=to).pack()
-        answers = self.operator.get(self.wire.control(role), payload=payload, timeout=60)
+        payload = Control(what="swap", part=part, to=to, question=uuid.uuid4().hex).pack()
+        answers = self.operator.get(self.wire.ask("swap"), payload=payload, timeout=60)
 
         def answer():
             (reply,) = answers

@@ -1,5 +1,6 @@
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,9 @@ from adapters.buses import certificates
 
 # pytest imports test modules without a path to their neighbours; `security_deployment` is one.
 sys.path.append(str(Path(__file__).parent))
+sys.path.append(str(Path(__file__).parents[1] / "buses"))
+sys.path.append(str(Path(__file__).parents[1] / "processes"))
+sys.path.append(str(Path(__file__).parents[1] / "results"))
 
 from security_deployment import Deployment
 
@@ -30,3 +34,11 @@ def keys(shared_keys, tmp_path):
 def deployment(keys):
     with Deployment(keys) as running:
         yield running
+
+
+@pytest.fixture
+def here():
+    """A folder whose path is short enough for a socket in it."""
+    folder = Path(tempfile.mkdtemp(prefix="ms-"))
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)

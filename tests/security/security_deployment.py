@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 import zenoh
 
-from adapters.buses import security
+from adapters.buses import security, tokens
 from adapters.buses.signing import Authority, Pem
 from adapters.buses.wire import never_freed
 
@@ -25,14 +25,14 @@ def direct(handler):
     return zenoh.handlers.Callback(handler, indirect=False)
 
 
-def config(mode, link, **edges):
+def config(mode, link, auth=None, **edges):
     quiet = {"enabled": False}
     return zenoh.Config.from_json5(
         json.dumps(
             {
                 "mode": mode,
                 "scouting": {"delay": 0, "multicast": quiet, "gossip": quiet},
-                "transport": {"shared_memory": quiet, "link": link},
+                "transport": {"shared_memory": quiet, "link": link, "auth": {"usrpwd": auth or {}}},
                 **edges,
             }
         )
@@ -54,12 +54,14 @@ def listen(link, address="tls/127.0.0.1", **edges):
     raise AssertionError("no port was free")
 
 
-def connect(port, link, *, mode="client", address="tls/127.0.0.1", timeout_ms=0):
+def connect(port, link, *, mode="client", address="tls/127.0.0.1", timeout_ms=0, auth=None):
     """Open a session to a router; by default it has one attempt."""
-    edges = {"connect": {"endpoints": [f"{address}:{port}"], "timeout_ms": timeout_ms, "exit_on_failure": True}}
+    edges = {
+        "connect": {"endpoints": [f"{address}:{port}"], "timeout_ms": timeout_ms, "exit_on_failure": True},
+    }
     if mode != "client":
         edges["listen"] = {"endpoints": []}
-    return zenoh.open(config(mode, link, **edges))
+    return zenoh.open(config(mode, link, auth, **edges))
 
 
 def ask(session, key, **options):
@@ -104,11 +106,16 @@ def shown(keys, name, side="connect"):
 class Deployment:
     """Knowledge, which answers whatever it is asked with its name, and those who joined it."""
 
-    def __init__(self, keys):
-        self.keys = keys
+    def __init__(self, keys=None, token=None):
+        self.keys, self.token = keys, token
         self._opened = ExitStack()
-        link = security.tls(keys, "knowledge")
-        self.knowledge, self.port = listen(link, access_control=security.access_control())
+        if token is None:
+            link = security.tls(keys, "knowledge")
+            self.knowledge, self.port = listen(link, access_control=security.access_control())
+        else:
+            rights = security.access_control("usernames")
+            auth = {"dictionary_file": str(token)}
+            self.knowledge, self.port = listen({}, "tcp/127.0.0.1", auth=auth, access_control=rights)
         self._opened.enter_context(self.knowledge)
         self.heard = []
         for key in ("mape/s/knowledge/**", "mape/s/*/append/*"):
@@ -124,8 +131,12 @@ class Deployment:
             query.reply("/".join("s" if part == "*" else part for part in str(query.key_expr).split("/")), "knowledge")
 
     def join(self, role, link=None, **how):
-        session = connect(self.port, link or security.tls(self.keys, role), timeout_ms=60_000, **how)
-        return self._opened.enter_context(session)
+        if self.token is None:
+            link = link or security.tls(self.keys, role)
+        else:
+            user = {"user": role, "password": tokens.secret(self.token, role)}
+            how = {"auth": user, "address": "tcp/127.0.0.1", **how}
+        return self._opened.enter_context(connect(self.port, link or {}, timeout_ms=5_000, **how))
 
     def close(self):
         self._opened.close()
