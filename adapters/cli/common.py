@@ -123,7 +123,9 @@ def wire_of(chosen: argparse.Namespace, endpoint: str, system: str) -> Wire:
     from adapters.buses.wire import Wire
 
     tls, token = (None if path is None else Path(path) for path in (chosen.tls, chosen.token))
-    return Wire(endpoint, system, tls, chosen.insecure, chosen.patience, token)
+    # `mapek up`, whose processes meet on this machine, takes no other patience.
+    patience = {"patience": chosen.patience} if hasattr(chosen, "patience") else {}
+    return Wire(endpoint, system, tls, chosen.insecure, token=token, **patience)
 
 
 @contextlib.contextmanager
