@@ -65,7 +65,7 @@ def check_endpoint(endpoint: str, anywhere: bool) -> None:
             f"endpoint {endpoint!r} is neither {UNIX}PATH nor tcp/HOST:PORT with a port from 1 to 65535, such as "
             "tcp/127.0.0.1:7447"
         )
-    if not anywhere and not _LOOPBACK.fullmatch(found["host"]):
+    if not anywhere and not on_this_machine(endpoint):
         raise ConfigError(
             f"endpoint {endpoint!r} can be reached from other machines, and without keys all that is sent can be read. "
             "Make keys with `mapek keys DIR` and give --tls DIR; or stay on 127.0.0.1; or, where the network itself is "
@@ -98,6 +98,16 @@ def reached(endpoint: str, keys: bool) -> str:
             f"Give {other} instead"
         )
     return endpoint
+
+
+def on_this_machine(endpoint: str) -> bool:
+    """Whether an endpoint can be reached from this machine alone.
+
+    >>> on_this_machine("tcp/127.0.0.1:7447"), on_this_machine("tcp/10.0.0.7:7447")
+    (True, False)
+    """
+    found = _NET.fullmatch(endpoint)
+    return found is None or _LOOPBACK.fullmatch(found["host"]) is not None
 
 
 def place_of(endpoint: str) -> tuple[str, int] | None:

@@ -300,6 +300,8 @@ class Wire:
         why = found.why if found else "start it, or look at the address"
         if self.tls is None and found:
             why += ", or has another token"
+            if endpoints.on_this_machine(endpoint):  # where nothing is slow, and to ask again changes no token
+                found = found._replace(slow=False)
         if self.tls is not None and not found:
             why += f" and at whether it trusts the certificate of {role} in {self.tls}"
         return Unanswered(f"no Knowledge answers on {self.endpoint}; {why} ({said})", found)
