@@ -46,6 +46,9 @@ def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
     def script() -> Feed:
         def feed(parts: Sequence[Schedule], i: int) -> list[Any]:
             readings = [_epsilon(part.epsilon) for part in parts]
+            for part, reading in zip(parts, readings, strict=True):
+                if (again := _epsilon(part.epsilon)) != reading:
+                    raise Broken(f"epsilon is {reading}, and {again} when it is read again; advance() alone changes it")
             for part in parts:
                 if i % 17 == 11:
                     part.reset()
@@ -56,21 +59,23 @@ def check_schedule(make: Callable[[], Schedule]) -> list[Finding]:
         return feed
 
     def explores_anew() -> None:
-        first, second = make(), make()
-        for x in returns:
-            first.advance(x)
-            second.advance(-abs(x))
-        first.reset()
-        second.reset()
-        for i, x in enumerate(returns):
-            one, other = _epsilon(first.epsilon), _epsilon(second.epsilon)
-            if one != other:
-                raise Broken(
-                    f"two with different returns before a reset explore at {one} and {other}, {i} episodes after it; "
-                    "reset() forgets what was counted since the last response"
-                )
-            first.advance(x)
-            second.advance(x)
+        for past in ([-abs(x) for x in returns], returns[: PASSES // 7], returns[:0]):
+            first, second = make(), make()
+            for x in returns:
+                first.advance(x)
+            for x in past:
+                second.advance(x)
+            first.reset()
+            second.reset()
+            for i, x in enumerate(returns):
+                one, other = _epsilon(first.epsilon), _epsilon(second.epsilon)
+                if one != other:
+                    raise Broken(
+                        f"two with other episodes before a reset, {len(returns)} and {len(past)}, explore at {one} and "
+                        f"{other}, {i} episodes after it; reset() forgets what was counted since the last response"
+                    )
+                first.advance(x)
+                second.advance(x)
 
     return judge(
         make,
@@ -100,6 +105,8 @@ def check_analyzer(make: Callable[[], Analyzer]) -> list[Finding]:
             Reading(name, signals[name], None if i % 3 else abs(signals[name]), i % divisor == 5, direction)
             for name, divisor, direction in zip(SIGNALS[:2], (11, 7), get_args(Direction)[:2], strict=True)
         )
+        if i % 13 == 8:
+            readings = ()  # a run without a detector
         available = (0, 1, 2) if i % 20 < 10 else (1, 4, 0)
         return Symptom(3, i + 1, signals, available, (0, 1, 2) if i % 10 else (0, 2, 9), readings)
 
@@ -118,7 +125,9 @@ def check_analyzer(make: Callable[[], Analyzer]) -> list[Finding]:
 
 
 def _request(analyzer: Analyzer, symptom: Symptom) -> ChangeRequest:
+    seen = dict(symptom.signals)
     request = analyzer.analyze(symptom)
+    _unwritten("analyze", symptom.signals, seen)
     if not isinstance(request, ChangeRequest):
         raise Broken(f"analyze() returned {request!r}; return a knowledge.ChangeRequest, also where nothing changed")
     if request[:2] != symptom[:2] or request.signals != symptom.signals:
@@ -138,6 +147,12 @@ def _request(analyzer: Analyzer, symptom: Symptom) -> ChangeRequest:
         )
     travels(request)
     return request
+
+
+def _unwritten(method: str, signals: dict[str, float], before: dict[str, float]) -> None:
+    """See that a part left the signals as they were, which all records of a pass share, and the log."""
+    if signals != before:
+        raise Broken(f"{method}() wrote {signals} over the signals {before}, which the log keeps; write into a copy")
 
 
 def check_planner(make: Callable[[], Planner]) -> list[Finding]:
@@ -186,7 +201,13 @@ class _PlannerScript:
             request,
         ):
             self.knowledge.log.append(record)
-        plans = [self._checked(part.plan(request, self.knowledge), i) for part in parts]
+        plans = []
+        for part in parts:
+            seen, known, plan = dict(signals), self.knowledge.actions, self.knowledge.plan
+            plans.append(self._checked(part.plan(request, self.knowledge), i))
+            _unwritten("plan", signals, seen)
+            if (self.knowledge.actions, self.knowledge.plan) != (known, plan) or self.knowledge.plan is not plan:
+                raise Broken("plan() wrote its own plan, or actions, into the knowledge; a planner returns its plan")
         self._follow(plans[0])
         return plans
 
@@ -226,6 +247,11 @@ class _PlannerScript:
         assert ack is Ack.OK
         self.known += tuple(a for a in plan.add if a not in self.known)
         self.known = tuple(a for a in self.known if a not in plan.drop)
+        if not {*self.known} & {*self.available, *plan.enable}:
+            raise Broken(
+                f"plan {plan.pass_no} leaves a Q-table of the actions {self.known}; {self.available} are available, of "
+                "which at least one must stay"
+            )
         self.available += tuple(a for a in plan.enable if a not in self.available)
         self.knowledge.plan = plan
         self.knowledge.actions = self.known

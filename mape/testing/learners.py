@@ -94,6 +94,26 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
                     "rows: it looks at them. Say on_policy = True, which makes them those that exploration chooses from"
                 )
 
+    def within_its_rows() -> None:
+        learner = make()
+        rule = np.errstate(all="ignore")(bound(learner).python())
+        given = inputs(learner)
+        rule(*given)
+        rows = given[1]
+        for count in range(1, len(rows) + 1):
+            other = inputs(learner)
+            others = [row for row in range(len(other[0])) if row not in rows[:count]]
+            other[0][others] += 1e3
+            rule(*other)
+            turns = np.arange(len(given[6]))
+            asked = (turns % len(rows) + 1 == count) & (turns % 2 == 1)  # else the greedy row may be one of the others
+            if (differ := np.flatnonzero(asked & (given[6] != other[6]))).size:
+                i = int(differ[0])
+                raise Broken(
+                    f"value gives {given[6][i]}, and {other[6][i]} where actions that are not offered are worth more; "
+                    f"of q it reads the rows rows[:count], here {rows[:count].tolist()}"
+                )
+
     def same_bits() -> None:
         learner = make()
         plain, compiled = inputs(learner), inputs(learner)
@@ -114,6 +134,7 @@ def check_learner(make: Callable[[], Learner]) -> list[Finding]:
             ("names its learning-rate parameters, a discount and bootstrap_terminal", constants),
             ("has pure rules with finite results", pure),
             ("says whether its value looks at what exploration chooses from", says_what_it_looks_at),
+            ("reads the rows of the actions on offer alone", within_its_rows),
             ("gives the same bits compiled as in plain Python", same_bits),
         ],
     )

@@ -151,6 +151,17 @@ def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) ->
                     "all its episodes anew, or is refused"
                 ) from None
 
+    def adds() -> None:
+        system, other = fresh(), fresh()
+        if not system.signal_names:
+            return
+        for number in range(1, episodes + 1):
+            one, another = _play(system, number), _play(other, number, base=1.0)
+            _added(system, one, another, f"step() of episode {number}")
+            if system.rules is not None:
+                ruled = _play_by_rules(other, number, base=1.0)
+                _added(system, one, ruled, f"rules.step of episode {number}")
+
     def by_rules() -> None:
         system, other = fresh(), fresh()
         if system.rules is None:
@@ -179,6 +190,7 @@ def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) ->
             ("says beforehand which actions an episode offers, or nothing", foretells),
             ("is deterministic: two fresh ones play the same episodes", deterministic),
             ("plays an episode the same whatever was played before", redriven),
+            ("adds its signals to those of the steps before", adds),
             ("has rules that equal its steps, bit for bit", by_rules),
             ("learns the same Q-table compiled and called", compiled),
         ][: None if episodes else 1],
@@ -208,8 +220,11 @@ def play_at_random(system: ManagedSystem, number: int) -> None:
     _play(system, number)
 
 
-def _play(system: ManagedSystem, number: int, held: dict[str, str] | None = None) -> list[_Moment]:
-    """Drive an episode by random actions; `held` takes what the system holds after the reset."""
+def _play(system: ManagedSystem, number: int, held: dict[str, str] | None = None, base: float = 0.0) -> list[_Moment]:
+    """Drive an episode by random actions.
+
+    `held` takes what the system holds after the reset; `base` is what the context holds before each step.
+    """
     state, available = system.begin(_episode(system, number))
     if held is not None:
         held.update(held_by(system, stated=True))
@@ -224,7 +239,7 @@ def _play(system: ManagedSystem, number: int, held: dict[str, str] | None = None
     context = np.zeros(len(system.signal_names))
     for step in range(1, min(system.max_steps, LONGEST) + 1):
         action = rng.choice(legal)
-        context[:] = 0.0
+        context[:] = base
         state, reward, terminated, truncated = system.step(action, context)
         where = f"step({action}) in episode {number}"
         _in_range(system, state, where)
@@ -261,7 +276,7 @@ def _in_range(system: ManagedSystem, state: Any, where: str) -> None:
         raise Broken(f"{where} went to state {state!r}; states are ints from 0 to {system.n_states - 1}")
 
 
-def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
+def _play_by_rules(system: ManagedSystem, number: int, base: float = 0.0) -> list[_Moment]:
     rules, draws = system.rules, _episode(system, number).uniforms
     assert rules is not None
     if (rules.reset_draws, rules.step_draws) != system.draws:
@@ -283,7 +298,7 @@ def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
     context = np.zeros(len(system.signal_names))
     for step in range(min(system.max_steps, LONGEST)):
         action = rng.choice([action for action, whether in zip(available, legal(), strict=True) if whether])
-        context[:] = 0.0
+        context[:] = base
         at = rules.reset_draws + step * rules.step_draws
         state, reward, terminated = rules.step(rules.params, phase, state, action, draws, at, context)
         ended = bool(terminated) or step + 1 == system.max_steps
@@ -292,6 +307,17 @@ def _play_by_rules(system: ManagedSystem, number: int) -> list[_Moment]:
         if ended:
             break
     return moments
+
+
+def _added(system: ManagedSystem, one: list[_Moment], other: list[_Moment], where: str) -> None:
+    """See that the steps of the other episode, begun with 1 in each signal, added to it what those of the first did."""
+    for step, (first, second) in enumerate(zip(one, other, strict=False)):
+        for name, from_none, from_one in zip(system.signal_names, first.signals, second.signals, strict=False):
+            if abs(from_one - 1.0 - from_none) > 1e-6 * max(1.0, abs(from_none)):
+                raise Broken(
+                    f"{where} leaves {name} at {from_none} where it was 0 before step {step}, and at {from_one} where "
+                    "it was 1; a step adds to the context, of which the episode's mean is made"
+                )
 
 
 def _compare(one: list[_Moment], other: list[_Moment], where: str) -> None:

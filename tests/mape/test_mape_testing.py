@@ -222,7 +222,7 @@ def test_an_analyzer_with_a_fault_is_told_its_fault(make, check, says):
             "keeps epsilon in [0, 1]",
             "a number in [0, 1]",
         ),
-        (scheduled(epsilon=property(lambda self: random.random())), DETERMINISTIC, "two fresh ones"),
+        (scheduled(epsilon=property(lambda self: random.random())), DETERMINISTIC, "when it is read again"),
         (scheduled(state=lambda self: self._state[0] and float("inf")), PLAIN, "is no plain JSON"),
         (scheduled(restore=lambda self, state: None), TAKES_UP, "restored before step"),
         (
