@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mape.specs import PartConfig
     from mape.trials import TrialResult, run_trial
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0.dev1"
 
 _HOMES = {
     "mape.bus": ("LocalBus",),

@@ -1,6 +1,6 @@
 """Durable Knowledge: one SQLite file (WAL) per run, which any SQLite tool can open.
 
-Schema, version 1 (``PRAGMA user_version``); times are seconds since 1970, in UTC:
+Schema, version 2 (``PRAGMA user_version``); times are seconds since 1970, in UTC:
 
 =============  ==========================================================================================
 table          holds
@@ -22,7 +22,11 @@ table          holds
 ``roles``      how often each role has joined: its newest epoch
 ``events``     what happened beside the records: who joined, what was refused or aborted; where ``loop`` is
                NULL, ``pass`` is the newest one that had been driven in any loop
+``seal``       the run's name for itself, the number of commits, and the total of all rows' sums
 =============  ==========================================================================================
+
+The last column ``sum`` of each table holds the checksum of the row, see `adapters.stores.sums`. The records of a
+loop and stage hang together as a chain: each one's sum is over the one before it too.
 """
 
 from __future__ import annotations
@@ -33,37 +37,66 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from adapters.stores.database import Database, Form
-from knowledge import QTable
+from adapters.stores.sums import record_sum, toggled
+from knowledge import STAGES, QTable
 from knowledge.q_table import SCHEMA as TABLE_SCHEMA
 
-VERSION = 1
+VERSION = 2
 APPLICATION = 0x4D50454B  # "MPEK"
 
 SCHEMA = """
-CREATE TABLE run (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE run (name TEXT PRIMARY KEY, value TEXT NOT NULL, sum BLOB NOT NULL);
 CREATE TABLE records (
-    loop INTEGER, pass INTEGER, stage INTEGER, body TEXT NOT NULL, row BLOB, PRIMARY KEY (loop, pass, stage)
+    loop INTEGER, pass INTEGER, stage INTEGER, body TEXT NOT NULL, row BLOB, sum BLOB NOT NULL,
+    PRIMARY KEY (loop, pass, stage)
 ) WITHOUT ROWID;
-CREATE TABLE dropped (loop INTEGER, first INTEGER, last INTEGER NOT NULL, PRIMARY KEY (loop, first)) WITHOUT ROWID;
+CREATE TABLE dropped (
+    loop INTEGER, first INTEGER, last INTEGER NOT NULL, sum BLOB NOT NULL, PRIMARY KEY (loop, first)
+) WITHOUT ROWID;
 CREATE TABLE snapshots (
-    loop INTEGER, role TEXT, pass INTEGER, final INTEGER NOT NULL, state TEXT NOT NULL, q_table TEXT,
+    loop INTEGER, role TEXT, pass INTEGER, final INTEGER NOT NULL, state TEXT NOT NULL, q_table TEXT, sum BLOB NOT NULL,
     PRIMARY KEY (loop, role, pass)
 ) WITHOUT ROWID;
 CREATE TABLE q_tables (
     sha256 TEXT PRIMARY KEY, actions TEXT NOT NULL, states INTEGER NOT NULL, body BLOB NOT NULL,
-    remembered INTEGER NOT NULL
+    remembered INTEGER NOT NULL, sum BLOB NOT NULL
 );
-CREATE TABLE versions (loop INTEGER, pass INTEGER, q_table TEXT NOT NULL, PRIMARY KEY (loop, pass)) WITHOUT ROWID;
+CREATE TABLE versions (
+    loop INTEGER, pass INTEGER, q_table TEXT NOT NULL, sum BLOB NOT NULL, PRIMARY KEY (loop, pass)
+) WITHOUT ROWID;
 CREATE TABLE swaps (
     loop INTEGER, pass INTEGER, part TEXT, spec TEXT NOT NULL, handed_over INTEGER NOT NULL, planned INTEGER NOT NULL,
-    PRIMARY KEY (loop, pass, part)
+    sum BLOB NOT NULL, PRIMARY KEY (loop, pass, part)
 ) WITHOUT ROWID;
-CREATE TABLE roles (role TEXT PRIMARY KEY, epoch INTEGER NOT NULL);
+CREATE TABLE roles (role TEXT PRIMARY KEY, epoch INTEGER NOT NULL, sum BLOB NOT NULL);
 CREATE TABLE events (
     number INTEGER PRIMARY KEY, time REAL NOT NULL, role TEXT NOT NULL, kind TEXT NOT NULL, loop INTEGER, pass INTEGER,
-    text TEXT NOT NULL
+    text TEXT NOT NULL, sum BLOB NOT NULL
+);
+CREATE TABLE seal (
+    one INTEGER PRIMARY KEY, run TEXT NOT NULL, commits INTEGER NOT NULL, total BLOB NOT NULL, sum BLOB NOT NULL
 );
 """
+
+COLUMNS = {
+    "run": ("name", "value"),
+    "records": ("loop", "pass", "stage", "body", "row"),
+    "dropped": ("loop", "first", "last"),
+    "snapshots": ("loop", "role", "pass", "final", "state", "q_table"),
+    "q_tables": ("sha256", "actions", "states", "body", "remembered"),
+    "versions": ("loop", "pass", "q_table"),
+    "swaps": ("loop", "pass", "part", "spec", "handed_over", "planned"),
+    "roles": ("role", "epoch"),
+    "events": ("number", "time", "role", "kind", "loop", "pass", "text"),
+}
+
+KEYS = {
+    "run": 1, "records": 3, "dropped": 2, "snapshots": 3, "q_tables": 1, "versions": 2, "swaps": 3, "roles": 1,
+    "events": 1,
+}  # fmt: skip
+
+READERS = {1: "0.2.0.dev0"}
+"""Which mapek reads a file of an older version."""
 
 SNAPSHOTS_KEPT = 1
 
@@ -105,37 +138,73 @@ class Event(NamedTuple):
 class Store(Database):
     """One run's file. All that is written waits for `commit`; how it is opened stands at `Database`."""
 
-    form = Form(APPLICATION, VERSION, SCHEMA)
+    form = Form(APPLICATION, VERSION, SCHEMA, COLUMNS, KEYS, READERS)
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self._heads: dict[tuple[int, int], bytes] = {}  # the sum of the last record of a loop and stage
+        super().__init__(*arguments, **options)
+
+    def roll_back(self) -> None:
+        """Forget everything since the last commit."""
+        self._heads.clear()
+        super().roll_back()
 
     # Facts of the run.
 
     def facts(self) -> dict[str, Any]:
         """Return the facts of the run; empty where it has not begun."""
-        found = self._all("SELECT name, value FROM run")
-        return {name: self._json(value, f"the {name} in value of run") for name, value in found}
+        return {name: self._json(value, f"the {name} in value of run") for name, value in self._rows("run")}
 
     def set_facts(self, **facts: Any) -> None:
         """Write facts of the run."""
         for name, value in facts.items():
-            self._write("INSERT OR REPLACE INTO run VALUES (?, ?)", name, json.dumps(value))
+            self._put("run", name, json.dumps(value))
 
     def join(self, role: str) -> int:
         """Count that `role` joins; return its epoch, from 1."""
-        self._write(
-            "INSERT INTO roles VALUES (?, 1) ON CONFLICT (role) DO UPDATE SET epoch = epoch + 1",
-            role,
-        )
-        return self.epoch(role)
+        epoch = self.epoch(role) + 1
+        self._put("roles", role, epoch)
+        return epoch
 
     def epoch(self, role: str) -> int:
         """Return how often `role` has joined."""
-        return max(0, self._number("SELECT epoch FROM roles WHERE role = ?", role))
+        found = self._row("roles", "WHERE role = ?", role)
+        return 0 if found is None else int(found[1])
 
     # The log.
 
     def append(self, loop: int, number: int, stage: int, body: str, row: bytes | None = None) -> None:
         """Write a record that is next in its log."""
-        self._write("INSERT INTO records VALUES (?, ?, ?, ?, ?)", loop, number, stage, body, row)
+        before = self._heads.get((loop, stage))
+        if before is None:
+            query = "SELECT sum FROM records WHERE loop = ? AND stage = ? ORDER BY pass DESC LIMIT 1"
+            before = (self._first(query, loop, stage) or (b"",))[0]
+        found = record_sum(before, loop, number, stage, body, row)
+        self._write("INSERT INTO records VALUES (?, ?, ?, ?, ?, ?)", loop, number, stage, body, row, found)
+        self._heads[loop, stage] = found
+        self._total = toggled(self._total, found)
+
+    def _sums(self, table: str) -> Iterator[bytes]:
+        """Yield the sums of a table's rows, each held against its row."""
+        if table != "records":
+            yield from super()._sums(table)
+            return
+        heads: dict[tuple[int, int], bytes] = {}
+        query = "SELECT loop, pass, stage, body, row, sum FROM records ORDER BY loop, pass, stage"
+        for loop, number, stage, body, row, found in self._each(query):
+            place = (loop, stage)
+            if (
+                type(body) is not str
+                or type(row) not in (bytes, type(None))
+                or found != record_sum(heads.get(place, b""), loop, number, stage, body, row)
+            ):
+                named = STAGES[stage].__name__ if stage in range(len(STAGES)) else f"stage {stage}"
+                raise self._unreadable(
+                    f"{named} {number} of loop {loop} is not the one that was written there, or the one before it is "
+                    "missing"
+                )
+            heads[place] = found
+            yield found
 
     def body(self, loop: int, number: int, stage: int) -> str | None:
         """Return a record as JSON, or None where it is not in the log."""
@@ -169,12 +238,11 @@ class Store(Database):
 
     def drop(self, loop: int, first: int, last: int) -> None:
         """Write that the episodes `first` to `last` were driven and could not be logged."""
-        self._write("INSERT INTO dropped VALUES (?, ?, ?)", loop, first, last)
+        self._put("dropped", loop, first, last)
 
     def dropped(self, loop: int) -> list[tuple[int, int]]:
         """Return what was dropped, as (first, last)."""
-        query = "SELECT first, last FROM dropped WHERE loop = ? ORDER BY first"
-        return self._all(query, loop)
+        return [(first, last) for _, first, last in self._rows("dropped", "WHERE loop = ? ORDER BY first", loop)]
 
     # States and tables.
 
@@ -182,30 +250,28 @@ class Store(Database):
         """Keep a role's state, and let go the one before it, and the Q-tables that nothing names any longer."""
         loop, role, number, state, table, final = snapshot
         key = None if table is None else self.keep_table(table, remembered=False)
-        self._write(
-            "INSERT OR REPLACE INTO snapshots VALUES (?, ?, ?, ?, ?, ?)",
-            loop, role, number, final, json.dumps(state), key,
-        )  # fmt: skip
-        self._write(
-            "DELETE FROM snapshots WHERE loop = ? AND role = ? AND pass NOT IN "
+        self._put("snapshots", loop, role, number, final, json.dumps(state), key)
+        self._remove(
+            "snapshots",
+            "loop = ? AND role = ? AND pass NOT IN "
             "(SELECT pass FROM snapshots WHERE loop = ? AND role = ? ORDER BY pass DESC LIMIT ?)",
             loop, role, loop, role, SNAPSHOTS_KEPT,
         )  # fmt: skip
         if role == "plan":  # it will not ask again for what it read before
-            self._write("DELETE FROM versions WHERE loop = ? AND pass <= ?", loop, number)
+            self._remove("versions", "loop = ? AND pass <= ?", loop, number)
         if key is not None or role == "plan":
-            self._write(
-                "DELETE FROM q_tables WHERE NOT remembered AND sha256 NOT IN (SELECT q_table FROM snapshots "
-                "WHERE q_table IS NOT NULL) AND sha256 NOT IN (SELECT q_table FROM versions)"
+            self._remove(
+                "q_tables",
+                "NOT remembered AND sha256 NOT IN (SELECT q_table FROM snapshots WHERE q_table IS NOT NULL) "
+                "AND sha256 NOT IN (SELECT q_table FROM versions)",
             )
 
     def snapshot(self, loop: int, role: str) -> Snapshot | None:
         """Return a role's newest state, or None."""
-        query = "SELECT pass, final, state, q_table FROM snapshots WHERE loop = ? AND role = ? ORDER BY pass DESC"
-        found = self._first(query, loop, role)
+        found = self._row("snapshots", "WHERE loop = ? AND role = ? ORDER BY pass DESC", loop, role)
         if found is None:
             return None
-        number, final, state, key = found
+        _, _, number, final, state, key = found
         table = None if key is None else self.table(key)
         return Snapshot(loop, role, number, self._json(state, "state of snapshots"), table, bool(final))
 
@@ -213,11 +279,9 @@ class Store(Database):
         """Keep a Q-table under its hash, which is returned; one that is remembered stays for the whole run."""
         key = table.sha256()
         header, body = table.to_bytes()
-        self._write(
-            "INSERT INTO q_tables VALUES (?, ?, ?, ?, ?) ON CONFLICT (sha256) DO UPDATE SET "
-            "remembered = max(remembered, excluded.remembered)",
-            key, json.dumps(header["actions"]), table.n_states, body, remembered,
-        )  # fmt: skip
+        there = self._first("SELECT remembered FROM q_tables WHERE sha256 = ?", key)
+        if there is None or there[0] < remembered:
+            self._put("q_tables", key, json.dumps(header["actions"]), table.n_states, body, remembered)
         return key
 
     def table(self, key: str) -> QTable | None:
@@ -228,11 +292,12 @@ class Store(Database):
         ResultsError
             It is not the one that was kept under the hash.
         """
-        found = self._first("SELECT actions, states, body FROM q_tables WHERE sha256 = ?", key)
+        found = self._row("q_tables", "WHERE sha256 = ?", key)
         if found is None:
             return None
+        _, text, states, body, _ = found
         try:
-            actions, states, body = json.loads(found[0]), found[1], found[2]
+            actions = json.loads(text)
             header = {"schema": TABLE_SCHEMA, "actions": actions, "shape": [len(actions), states], "dtype": "<f8"}
             return QTable.from_bytes({**header, "sha256": key}, body)
         except (TypeError, ValueError) as error:
@@ -241,43 +306,35 @@ class Store(Database):
     def keep_version(self, loop: int, number: int, table: QTable) -> None:
         """Keep the Q-table at the end of episode `number`, for a planner that asked for it."""
         key = self.keep_table(table, remembered=False)
-        self._write("INSERT OR REPLACE INTO versions VALUES (?, ?, ?)", loop, number, key)
+        self._put("versions", loop, number, key)
 
     def version(self, loop: int, number: int) -> QTable | None:
         """Return the Q-table at the end of episode `number` if it was asked for before, or None."""
-        query = "SELECT q_table FROM versions WHERE loop = ? AND pass = ?"
-        found = self._first(query, loop, number)
-        return None if found is None else self.table(found[0])
+        found = self._row("versions", "WHERE loop = ? AND pass = ?", loop, number)
+        return None if found is None else self.table(found[2])
 
     # What happened beside the records.
 
     def keep_swap(self, swap: Swap) -> None:
         """Write that a part was replaced; what was planned does not take the place of what was asked for."""
         loop, number, part, spec, handed_over, planned = swap
+        there = self._row("swaps", "WHERE loop = ? AND pass = ? AND part = ?", loop, number, part)
         # Who does a pass again first tells again of the part that was planned, and not of the one that followed it.
-        self._write(
-            "INSERT INTO swaps VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (loop, pass, part) DO UPDATE SET "
-            "spec = excluded.spec, handed_over = excluded.handed_over, planned = excluded.planned "
-            "WHERE planned OR NOT excluded.planned",
-            loop, number, part, json.dumps(spec), handed_over, planned,
-        )  # fmt: skip
+        if there is None or there[5] or not planned:
+            self._put("swaps", loop, number, part, json.dumps(spec), handed_over, planned)
 
     def swaps(self) -> list[Swap]:
         """Return the parts that were replaced while the loop ran, in order of loop and pass."""
-        found = self._all("SELECT loop, pass, part, spec, handed_over, planned FROM swaps ORDER BY loop, pass, part")
         return [
             Swap(loop, number, part, self._json(spec, "spec of swaps"), bool(handed_over), bool(planned))
-            for loop, number, part, spec, handed_over, planned in found
+            for loop, number, part, spec, handed_over, planned in self._rows("swaps", "ORDER BY loop, pass, part")
         ]
 
     def event(self, role: str, kind: str, text: str, loop: int | None = None, number: int | None = None) -> None:
         """Write an event, with the time of this machine's clock."""
-        self._write(
-            "INSERT INTO events (time, role, kind, loop, pass, text) VALUES (?, ?, ?, ?, ?, ?)",
-            time.time(), role, kind, loop, number, text,
-        )  # fmt: skip
+        place = max(0, self._number("SELECT max(number) FROM events")) + 1
+        self._put("events", place, time.time(), role, kind, loop, number, text)
 
     def events(self, after: int = 0) -> list[Event]:
         """Return the events numbered above `after`."""
-        query = "SELECT number, time, role, kind, loop, pass, text FROM events WHERE number > ? ORDER BY number"
-        return [Event(*row) for row in self._all(query, after)]
+        return [Event(*row) for row in self._rows("events", "WHERE number > ? ORDER BY number", after)]

@@ -9,7 +9,8 @@ from typing import Any
 
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
-from adapters.stores.sqlite_store import Snapshot, Swap
+from adapters.stores.sqlite_store import COLUMNS, KEYS, Snapshot, Swap
+from adapters.stores.sums import SIZE, record_sum, row_sum, toggled
 from adapters.systems import make_system
 from knowledge import STAGES, ChangePlan, Knowledge, Log, Record, to_json
 from mape.config import Config, from_table
@@ -125,11 +126,38 @@ def write_free_log(path: Path, config: Config, lag: int, dropped: Iterable[int] 
         system.close()
 
 
-def change(path: Path, statement: str, *values: Any) -> None:
+def damage(path: Path, statement: str, *values: Any) -> None:
     """Change a log behind Knowledge's back."""
     db = sqlite3.connect(path)
     with db:
         assert db.execute(statement, values).rowcount == 1
+    db.close()
+
+
+def change(path: Path, statement: str, *values: Any) -> None:
+    """Change a log as if it had been written so: its checksums fit."""
+    damage(path, statement, *values)
+    reseal(path)
+
+
+def reseal(path: Path) -> None:
+    """Make a log's checksums fit what stands in it."""
+    db = sqlite3.connect(path)
+    total, heads = 0, dict[tuple[int, int], bytes]()
+    with db:
+        for table, columns in COLUMNS.items():
+            key = columns[: KEYS[table]]
+            for row in db.execute(f"SELECT {', '.join(columns)} FROM {table} ORDER BY {', '.join(key)}").fetchall():
+                found = row_sum(table, row)
+                if table == "records":
+                    place = (row[0], row[2])
+                    found = heads[place] = record_sum(heads.get(place, b""), *row)
+                where = " AND ".join(f"{name} = ?" for name in key)
+                db.execute(f"UPDATE {table} SET sum = ? WHERE {where}", (found, *row[: len(key)]))
+                total = toggled(total, found)
+        run, commits = db.execute("SELECT run, commits FROM seal").fetchone()
+        sealed = total.to_bytes(SIZE, "big")
+        db.execute("UPDATE seal SET total = ?, sum = ?", (sealed, row_sum("seal", (run, commits, sealed))))
     db.close()
 
 

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from replay_logs import change, small, write_log
+from replay_logs import change, damage, small, write_log
 
 from adapters.cli.main import main
 from adapters.stores import Store
@@ -18,23 +18,27 @@ def folder(tmp_path: Path) -> Path:
 
 
 DAMAGES = {
-    "the Q-table of the end": ("UPDATE q_tables SET body = zeroblob(length(body) - 8)", "the Q-table .* is damaged"),
-    "its values": ("UPDATE q_tables SET body = zeroblob(length(body))", "the Q-table .* is damaged"),
-    "the config": ("UPDATE run SET value = '{' WHERE name = 'config'", "the config in value of run is no JSON"),
-    "the layout": ("UPDATE run SET value = '{}' WHERE name = 'layout'", "the layout of the run's rows"),
-    "the state": ("UPDATE snapshots SET state = '{'", "state of snapshots is no JSON"),
+    "the Q-table of the end": "UPDATE q_tables SET body = zeroblob(length(body) - 8)",
+    "its values": "UPDATE q_tables SET body = zeroblob(length(body))",
+    "the config": "UPDATE run SET value = json_set(value, '$.seed', 5) WHERE name = 'config'",
+    "the state": "UPDATE snapshots SET state = '{}'",
 }
 
 
 @pytest.mark.parametrize("what", DAMAGES)
 def test_replay_names_what_is_damaged(folder: Path, capsys: pytest.CaptureFixture[str], what: str) -> None:
-    statement, says = DAMAGES[what]
-    change(folder / "log.sqlite", statement)
+    damage(folder / "log.sqlite", DAMAGES[what])
 
     assert main(["replay", str(folder)]) == 1
+    table = DAMAGES[what].split()[1]
     told = capsys.readouterr().err
-    assert told.startswith("mapek: ")
-    assert re.search(says, told), told
+    assert re.search(rf"mapek: .*log\.sqlite cannot be read: in its table {table} the row of ", told), told
+
+
+def test_replay_names_a_layout_that_is_none(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(folder / "log.sqlite", "UPDATE run SET value = '{}' WHERE name = 'layout'")
+    assert main(["replay", str(folder)]) == 1
+    assert "the layout of the run's rows" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("table", ["run", "records", "dropped", "snapshots", "q_tables", "swaps"])

@@ -1,6 +1,7 @@
 """A log is derived again record by record; what differs is named, what is missing too."""
 
 import json
+import shutil
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,12 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from replay_logs import change, places, small, write_free_log, write_log
+from replay_logs import change, places, reseal, small, write_free_log, write_log
 
 from adapters.cli.main import main
 from adapters.replay.records import LogReplay, Replayed
 from adapters.stores import Store
+from adapters.stores.mark import mark_path
 from adapters.systems import make_system
 from knowledge import STAGES
 from mape.config import Config
@@ -39,6 +41,7 @@ def copied(log: Path, folder: Path) -> Path:
     source.backup(target)
     source.close()
     target.close()
+    shutil.copy(mark_path(log), mark_path(path))
     return path
 
 
@@ -94,6 +97,7 @@ def test_a_log_that_ends_early_is_compared_as_far_as_it_goes(
         for place in PLACES[length:]:
             db.execute("DELETE FROM records WHERE loop = 0 AND pass = ? AND stage = ?", place)
     db.close()
+    reseal(path)
 
     found = replayed(path)
 
@@ -151,6 +155,7 @@ def test_a_q_table_of_the_end_that_was_changed_is_noticed(log: Path, tmp_path: P
         db.execute("INSERT INTO q_tables SELECT * FROM other.q_tables")
         db.execute("UPDATE snapshots SET q_table = (SELECT q_table FROM other.snapshots WHERE role = 'execute')")
     db.close()
+    reseal(path)
 
     found = replayed(path)
 
@@ -305,6 +310,7 @@ def folder(log: Path, tmp_path: Path) -> Path:
     path = tmp_path / "out"
     path.mkdir()
     copied(log, tmp_path).rename(path / "log.sqlite")
+    (tmp_path / "changed.mark").rename(path / "log.mark")
     assert main(["run", write_config(tmp_path), "--no-figures", "-q", "--out", str(tmp_path / "run")]) == 0
     (tmp_path / "run" / "result.json").rename(path / "result.json")
     return path
