@@ -200,7 +200,7 @@ def finish(chosen: argparse.Namespace, folder: RunFolder, result: Mapping[str, A
     elif chosen.json:
         target = Path(chosen.json)
         if _is_replaced(target):
-            write_json(target, result, folder.kept())
+            write_json(target, result, folder.kept(), opener=None)  # the user's own place, with the mode of the place
         else:
             try:
                 with open(target, "w", encoding="utf-8") as file:

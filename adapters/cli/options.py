@@ -222,6 +222,15 @@ def parser() -> argparse.ArgumentParser:
     replay.add_argument("--json", action="store_true", help="as JSON; with --to the whole Q-table is in it")
     _how(replay)
 
+    verify = commands.add_parser(
+        "verify",
+        help="hold what is on disk against its checksums",
+        description="Hold a run's folder against its checksums: each record of a log, each kept state, table and "
+        "result; and the log against its mark. Nothing is run again. The first thing that is not as it was written "
+        "is named, with exit code 1.",
+    )
+    verify.add_argument("folder", metavar="DIR", help="folder of the run, or its log.sqlite")
+
     resume = commands.add_parser(
         "resume",
         help="continue an unfinished run, whatever command began it",
@@ -231,6 +240,10 @@ def parser() -> argparse.ArgumentParser:
     resume.add_argument(
         "--mended", action="store_true",
         help="go on although modules of your own have changed since; what is finished stays as it is",
+    )  # fmt: skip
+    resume.add_argument(
+        "--json", metavar="FILE", help="write the result as JSON too (- for standard output); that of the run's own "
+        "command is not taken from the folder",
     )  # fmt: skip
     _how(resume)
 
@@ -334,6 +347,11 @@ def _keeps(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="passes between two kept states (default 100)",
     )
+    command.add_argument(
+        "--wal-limit", type=_positive, default=256, metavar="MB",
+        help="size of log.sqlite-wal at which a reader who stays in the middle of a transaction ends the run "
+        "(default 256)",
+    )  # fmt: skip
 
 
 def _secure(command: argparse.ArgumentParser) -> None:

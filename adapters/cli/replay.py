@@ -14,7 +14,7 @@ from adapters.cli.common import prepare
 from adapters.cli.sentences import ids, sentence
 from adapters.replay.records import Difference, LogReplay, Moment, Replayed, as_json, log_of
 from adapters.replay.tables import replay_tables
-from adapters.results.files import read_json
+from adapters.results.files import read_sealed
 from adapters.results.folder import LOGS_OF_AGENTS, MENDED, MODULES, read_manifest
 from adapters.results.own_code import other_versions
 from adapters.scratch import scratch
@@ -54,7 +54,7 @@ def _log(chosen: argparse.Namespace, path: Path, log: LogReplay) -> int:
     result = path.parent / "result.json"
     compared = difference is None and chosen.to is None and result.exists()
     if compared:
-        stored = read_json(result)
+        stored = read_sealed(result)
         if path.name != LOG_NAME:  # that of one of several agents, of which less is said
             agent = path.stem.removeprefix(LOGS_OF_AGENTS)
             stored = {"log_sha256": _combined(found, "log_sha256"), **stored.get("agents", {}).get(agent, {})}

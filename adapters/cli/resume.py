@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
+from adapters import private
 from adapters.cli.main import dispatch
 from adapters.cli.options import parser
 from adapters.results.folder import read_manifest
@@ -20,6 +22,7 @@ from mape.errors import ConfigError, ResultsError
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
     folder = Path(chosen.folder).resolve()
+    private.refuse_links(folder)
     manifest = read_manifest(folder)
     if (folder / "result.json").exists():
         raise ResultsError(f"{folder} holds a finished run, which is left as it is; there is nothing to continue")
@@ -32,6 +35,12 @@ def execute(chosen: argparse.Namespace) -> int:
     again.out = str(folder)
     again.quiet = again.quiet or chosen.quiet
     again.mended = chosen.mended
+    # What stands in a folder may be somebody else's word, and is not to say which file of this machine is replaced.
+    if again.json not in (None, "-") and chosen.json is None:
+        print(f"--json {again.json} is not written; say it again where it is to be: --json FILE", file=sys.stderr)
+        again.json = None
+    if chosen.json is not None:
+        again.json = chosen.json if chosen.json == "-" else os.path.abspath(chosen.json)
     if chosen.workers is not None:
         if not hasattr(again, "workers"):
             raise ConfigError(f"`mapek {again.command}` has no --workers: each role is a process of its own")

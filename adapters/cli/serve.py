@@ -66,7 +66,11 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
     if not knowledge:
         serve_role(config, chosen.role, wire, released, chosen.hang_after)
         return 0
-    kept = {"durability": chosen.durability, "snapshot_every": chosen.snapshot_every}
+    kept = {
+        "durability": chosen.durability,
+        "snapshot_every": chosen.snapshot_every,
+        "wal_limit": chosen.wal_limit,
+    }
     if chosen.log is not None:  # somebody else makes the tables
         path = None if chosen.log == ":memory:" else Path(chosen.log)  # in memory: to be measured against
         serve_knowledge(config, wire, path, **kept)

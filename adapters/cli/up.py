@@ -11,6 +11,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from adapters import private
 from adapters.buses import tokens
 from adapters.buses.endpoints import check_endpoint
 from adapters.buses.wire import Wire, system_segment
@@ -123,7 +124,7 @@ def _check(config: Config) -> object:
 
 def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, folder: RunFolder) -> None:
     logs = folder.path / "logs"
-    logs.mkdir(exist_ok=True)
+    private.make_folder(logs)
     wait_for_orphans(folder.path)
     ledger = open_ledger(config, folder.path / LOG_NAME, chosen.durability)
     with ledger.store:
@@ -137,6 +138,7 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         *(["--insecure"] if wire.insecure else []),
     ]
     kept = ["--durability", chosen.durability, "--snapshot-every", str(chosen.snapshot_every)]
+    kept += ["--wal-limit", str(chosen.wal_limit)]
     commands = {
         KNOWLEDGE: command_of(
             KNOWLEDGE, path, "--listen", wire.endpoint, "--log", str(folder.path / LOG_NAME), *kept, *shared

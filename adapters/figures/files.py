@@ -12,6 +12,7 @@ from pathlib import Path
 import matplotlib
 from matplotlib.figure import Figure
 
+from adapters import private
 from adapters.figures.style import PNG_DPI
 from mape import __version__
 
@@ -54,12 +55,12 @@ def save(figure: Figure, folder: Path, name: str, *, title: str = "", about: str
     if not name or name.startswith(".") or any(sign in name for sign in "/\\\0"):
         raise ValueError(f"name is {name!r}; give a file name without folder and ending, such as 'learning_curve'")
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    private.make_folder(folder)
     paths = [folder / f"{name}.png", folder / f"{name}.pdf"]
     parts = [path.with_name(f".{path.name}.{secrets.token_hex(4)}.part") for path in paths]
     try:
         for part, data in zip(parts, _drawn(figure, title, about), strict=True):
-            with open(part, "xb") as file:
+            with open(part, "xb", opener=private.opener) as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())

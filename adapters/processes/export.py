@@ -79,7 +79,7 @@ def export(config: Config, ledger: Ledger, stem: Path, trace: npt.NDArray[np.voi
     if trace is not None:
         arrays["trace"] = trace
         arrays |= {f"readings_{name}": np.concatenate(parts) for name, parts in readings.items()}
-    write_heads(stem, results, arrays, len(results) * config.episodes, digest.hexdigest())
+    write_heads(stem, config, results, arrays, len(results) * config.episodes, digest.hexdigest())
     return results
 
 

@@ -22,6 +22,7 @@ from adapters.buses.wire import Wire, versions
 from adapters.processes.supervise import ENDS_WITHIN
 from adapters.scratch import remove_orphan
 from adapters.stores import Store
+from adapters.stores.database import WAL_LIMIT
 from adapters.stores.ledger import Ledger
 from mape.config import Config
 from mape.errors import PartError, ResultsError, Stop
@@ -114,7 +115,7 @@ def quick_switches() -> None:
     sys.setswitchinterval(0.0005)
 
 
-def open_ledger(config: Config, path: Path | None, durability: str) -> Ledger:
+def open_ledger(config: Config, path: Path | None, durability: str, wal_limit: int = WAL_LIMIT) -> Ledger:
     """Open or begin Knowledge's file of a run.
 
     Raises
@@ -123,7 +124,7 @@ def open_ledger(config: Config, path: Path | None, durability: str) -> Ledger:
         It is that of another run, or not whole, or another process writes it.
     """
     with contextlib.ExitStack() as opened:
-        store = opened.enter_context(Store(path, durability))
+        store = opened.enter_context(Store(path, durability, wal_limit=wal_limit))
         facts = store.facts()
         wanted = json.loads(config.to_json())
         if facts.get("config", wanted) != wanted:
@@ -137,7 +138,13 @@ def open_ledger(config: Config, path: Path | None, durability: str) -> Ledger:
 
 
 def serve_knowledge(
-    config: Config, wire: Wire, path: Path | None, *, durability: str = "normal", snapshot_every: int = 100
+    config: Config,
+    wire: Wire,
+    path: Path | None,
+    *,
+    durability: str = "normal",
+    snapshot_every: int = 100,
+    wal_limit: int = WAL_LIMIT,
 ) -> None:
     """Be Knowledge until the run is complete and the roles have left.
 
@@ -147,7 +154,7 @@ def serve_knowledge(
         The log cannot be written; what was acknowledged is kept.
     """
     quick_switches()
-    ledger = open_ledger(config, path, durability)
+    ledger = open_ledger(config, path, durability, wal_limit)
     try:
         hub = KnowledgeHub(ledger, wire, json.loads(config.to_json()), versions(), snapshot_every)
         with hub:

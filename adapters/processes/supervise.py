@@ -26,6 +26,7 @@ from typing import Self
 
 import zenoh
 
+from adapters import private
 from adapters.buses.messages import Status
 from adapters.buses.wire import LEASE_MS, Wire
 from adapters.roles import KNOWLEDGE, OPERATOR, ROLES
@@ -105,7 +106,7 @@ class Child:
         """Start it, in a session of its own, so that Ctrl-C reaches the supervisor alone."""
         if self.process is not None and self.process.stdin is not None:
             self.process.stdin.close()
-        with open(self.log, "ab") as log:
+        with open(self.log, "ab", opener=private.opener) as log:
             self.process = subprocess.Popen(
                 self.command, stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
             )

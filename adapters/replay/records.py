@@ -10,10 +10,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from adapters import private
 from adapters.replay.derivations import Derivation, FedByLog, WholeLoop, with_swaps
 from adapters.results.folder import LOGS_OF_AGENTS
 from adapters.stores import LOG_NAME, Store
 from adapters.stores.ledger import differences, layout_from
+from adapters.stores.mark import mark_path
 from adapters.systems import make_system
 from adapters.systems.declared import is_plant
 from knowledge import STAGES, Ack, ChangePlan, FreeLog, Observation, Record, RowLayout, from_json, to_json
@@ -32,14 +34,17 @@ def log_of(path: Path) -> Path | None:
     Raises
     ------
     ResultsError
-        There is no such folder or file.
+        There is no such folder or file, or a link is in the folder.
     """
     if path.is_dir():
+        private.refuse_links(path)
         several = sorted(path.glob(f"{LOGS_OF_AGENTS}*.sqlite"))
         if several:
             names = ", ".join(str(log) for log in several)
             raise ConfigError(f"{path} holds a log for each agent; name one of them: {names}")
-        return path / LOG_NAME if (path / LOG_NAME).is_file() else None
+        log = path / LOG_NAME
+        # With a mark, and no log, there was one.
+        return log if log.is_file() or mark_path(log).is_file() else None
     if not path.exists():
         near = nearest_path(path, os.path.exists)
         raise ResultsError(

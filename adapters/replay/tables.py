@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from adapters.experiments.runner import run_agents
 from adapters.results import RunFolder
-from adapters.results.files import read_json, read_npz
+from adapters.results.files import hold, read_npz, read_sealed
 from adapters.results.table import COLUMNS, read_episodes
 from adapters.systems.declared import is_plant
 from mape.config import Config, from_table
@@ -52,7 +52,7 @@ def replay_tables(
     """
     if not (path / "result.json").exists():
         raise ResultsError(f"{path} holds an unfinished run; finish it with `mapek resume {path}`")
-    stored = read_json(path / "result.json")
+    stored = read_sealed(path / "result.json")
     configs = {agent: from_table(table, f"{path}, {agent}") for agent, table in manifest["agents"].items()}
     for config in configs.values():
         if is_plant(config.system):
@@ -93,6 +93,7 @@ def _differences(path: Path, scratch: Path, agent: str, config: Config) -> Itera
 
 
 def _table_differences(path: Path, scratch: Path, agent: str, config: Config) -> Iterator[str]:
+    hold(path / f"q_tables-{agent}.npz")
     there, here = (read_npz(folder / f"q_tables-{agent}.npz", "It cannot be compared.") for folder in (path, scratch))
     for unit in range(config.units):
         named = f"agent {agent}, {config.unit_name(*divmod(unit, config.loops))}"

@@ -12,10 +12,10 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.files import read_json, read_npz, whole, write_json
+from adapters.results.files import file_sum, read_npz, read_sealed, whole, write_sealed
 from adapters.results.table import DTYPE, from_rows, write_npz
 from adapters.systems.lending import Lender
-from mape.config import from_table
+from mape.config import Config, from_table
 from mape.errors import MapekError, ResultsError
 from mape.execute.episode import TRACE_COLUMNS
 from mape.loop import Loop
@@ -109,25 +109,44 @@ def run_chunk(
             if unit == 0 and trace is not None:
                 arrays["trace"] = np.concatenate(steps) if steps else np.empty(0, TRACE_DTYPE)
                 arrays |= {f"readings_{name}": np.concatenate(parts) for name, parts in readings.items()}
-    write_heads(path, results, arrays, len(results) * config.episodes, whole_units.hexdigest())
+    write_heads(path, config, results, arrays, len(results) * config.episodes, whole_units.hexdigest())
     if failure is not None:
         raise failure
     return results
 
 
 def write_heads(
-    stem: Path, results: list[TrialResult], arrays: dict[str, npt.NDArray[Any]], rows: int, rows_sha256: str
+    stem: Path,
+    config: Config,
+    results: list[TrialResult],
+    arrays: dict[str, npt.NDArray[Any]],
+    rows: int,
+    rows_sha256: str,
 ) -> None:
-    """Write what stands beside a chunk's rows: its arrays and, last, its results, which say that it is whole."""
+    """Write what stands beside a chunk's rows: its arrays and, last, its results, which say that it is whole.
+
+    They say which chunk of what it is, too: one that was put in the place of another is told.
+    """
     with whole(stem.with_suffix(".npz")) as file:
         np.savez(file, allow_pickle=False, **_packed(arrays))
-    write_json(
+    write_sealed(
         stem.with_suffix(".json"),
-        {"rows": rows, "rows_sha256": rows_sha256, "trials": [r._asdict() for r in results]},
+        {
+            "chunk": stem.name,
+            "config_sha256": _config_sum(config),
+            "rows": rows,
+            "rows_sha256": rows_sha256,
+            "arrays_sha256": file_sum(stem.with_suffix(".npz")),
+            "trials": [r._asdict() for r in results],
+        },
     )
 
 
 _TRACED = ("trace", *(f"readings_{name}" for name in READINGS))
+
+
+def _config_sum(config: Config) -> str:
+    return hashlib.sha256(config.to_json().encode()).hexdigest()
 
 
 def _packed(arrays: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
@@ -163,19 +182,24 @@ def _break_off(file: IO[bytes], rows: int, target: Path, loops: int = 1) -> None
     file.seek(0, 2)
 
 
-def read_chunk(stem: Path) -> list[TrialResult] | None:
-    """Return the results of a finished chunk, or None where it is not there as a whole.
+def read_chunk(stem: Path, config: Config) -> list[TrialResult] | None:
+    """Return the results of a finished chunk of `config`, or None where it is not there as a whole.
 
     Raises
     ------
     ResultsError
-        The chunk says that it is finished, but its rows are cut short or changed.
+        The chunk says that it is finished, but its rows are cut short, or it is that of other trials or another run.
     """
     if not stem.with_suffix(".json").exists():
         return None
-    head = read_json(stem.with_suffix(".json"))
+    head = _head(stem)
     rows = stem.with_suffix(".rows")
     try:
+        if head["chunk"] != stem.name or head["config_sha256"] != _config_sum(config):
+            raise ResultsError(
+                f"{stem}.json is of chunk {head['chunk']} of this or another run; it stands in the wrong place. "
+                f"Delete {stem}.* to have these trials run again."
+            )
         if rows.stat().st_size != head["rows"] * DTYPE.itemsize:
             raise ResultsError(
                 f"{rows} is cut short: {rows.stat().st_size} bytes instead of {head['rows'] * DTYPE.itemsize}. "
@@ -206,12 +230,20 @@ def read_arrays(stem: Path) -> dict[str, npt.NDArray[Any]]:
         The rows or the arrays are not those that were written.
     """
     again = f"Delete {stem}.* and give the same command to have these trials run again."
-    rows = stem.with_suffix(".rows")
-    with open(rows, "rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != read_json(stem.with_suffix(".json"))["rows_sha256"]:
-        raise ResultsError(f"{rows} was changed after it was written: its SHA-256 is {found}. {again}")
+    head = _head(stem)
+    for ending, entry in ((".rows", "rows_sha256"), (".npz", "arrays_sha256")):
+        path = stem.with_suffix(ending)
+        found = file_sum(path)
+        if found != head[entry]:
+            raise ResultsError(f"{path} was changed after it was written: its SHA-256 is {found}. {again}")
     return _unpacked(read_npz(stem.with_suffix(".npz"), again))
+
+
+def _head(stem: Path) -> Any:
+    try:
+        return read_sealed(stem.with_suffix(".json"))
+    except ResultsError as error:
+        raise ResultsError(f"{error}. Delete {stem}.* to have these trials run again.") from error
 
 
 def remove_parts(folder: Path) -> None:

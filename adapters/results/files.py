@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from adapters import private
 from mape.errors import ResultsError
 
 DAMAGE = (OSError, EOFError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
@@ -29,9 +31,13 @@ GO_ON = (
 )
 
 
+Opener = Callable[[str, int], int]
+"""What `open` takes as its `opener`."""
+
+
 @contextlib.contextmanager
-def whole(path: Path, way_out: str = GO_ON) -> Iterator[IO[bytes]]:
-    """Open a file that takes its name only when all of it is written.
+def whole(path: Path, way_out: str = GO_ON, opener: Opener | None = private.opener) -> Iterator[IO[bytes]]:
+    """Open a file that takes its name only when all of it is written; for its owner alone, unless `opener` is another.
 
     Raises
     ------
@@ -41,7 +47,7 @@ def whole(path: Path, way_out: str = GO_ON) -> Iterator[IO[bytes]]:
     """
     part = _part(path)
     try:
-        with open(part, "wb") as file:
+        with open(part, "wb", opener=opener) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -64,7 +70,7 @@ def try_whole(path: Path, way_out: str) -> None:
     """
     part = _part(path)
     try:
-        with open(part, "wb"):
+        with open(part, "wb", opener=private.opener):
             part.unlink()
     except OSError as error:
         raise cannot_write(path, error, way_out) from error
@@ -79,10 +85,10 @@ def cannot_write(path: Path, error: OSError, way_out: str = GO_ON) -> ResultsErr
     return ResultsError(f"{path} cannot be written: {error.strerror or error}. {way_out}")
 
 
-def write_json(path: Path, data: Any, way_out: str = GO_ON) -> None:
-    """Write data as indented JSON; a number that is not finite is a ValueError."""
+def write_json(path: Path, data: Any, way_out: str = GO_ON, opener: Opener | None = private.opener) -> None:
+    """Write data as indented JSON; a number that is not finite is a ValueError. `opener` is as `whole` takes it."""
     text = json.dumps(data, indent=2, sort_keys=False, allow_nan=False) + "\n"
-    with whole(path, way_out) as file:
+    with whole(path, way_out, opener) as file:
         file.write(text.encode())
 
 
@@ -100,6 +106,71 @@ def read_json(path: Path) -> Any:
         raise ResultsError(f"{path} cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise ResultsError(f"{path} is damaged ({error}); delete it to have it made again") from error
+
+
+SUM = "sha256"
+"""Entry of a JSON file of ours for the SHA-256 of its other entries."""
+
+
+def write_sealed(path: Path, data: Mapping[str, Any], way_out: str = GO_ON) -> None:
+    """Write JSON with a checksum of all that stands in it."""
+    write_json(path, {**data, SUM: _sum_of(data)}, way_out)
+
+
+def read_sealed(path: Path) -> Any:
+    """Read what `write_sealed` wrote, without its checksum.
+
+    Raises
+    ------
+    ResultsError
+        It cannot be read, is cut short, or is not what was written.
+    """
+    found = read_json(path)
+    if not isinstance(found, dict) or found.pop(SUM, None) != _sum_of(found):
+        raise ResultsError(f"{path} was changed after it was written: its {SUM} is not that of its other entries")
+    return found
+
+
+def _sum_of(data: Mapping[str, Any]) -> str:
+    # Parsed again it is the same: JSON has no tuples, and no names but texts.
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def file_sum(path: Path) -> str:
+    """Return a file's SHA-256.
+
+    Raises
+    ------
+    ResultsError
+        It cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ResultsError(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def hold(path: Path) -> None:
+    """Hold a file in the folder of a finished run against its checksum in ``result.json``.
+
+    Raises
+    ------
+    ResultsError
+        It is not what was written, or the result is not.
+    """
+    result = path.parent / "result.json"
+    if not (result.is_file() and (path.parent / "manifest.json").is_file()):
+        return
+    wanted = read_sealed(result).get("files", {}).get(path.name)
+    if wanted is not None and file_sum(path) != wanted:
+        raise changed(path)
+
+
+def changed(path: Path) -> ResultsError:
+    """Say that a file of a finished run is not the one that was written."""
+    said = f"{path} was changed after it was written: its SHA-256 is not the one in result.json."
+    return ResultsError(f"{said} {made_again(path)}".rstrip())
 
 
 def made_again(path: Path) -> str:

@@ -1,6 +1,6 @@
 """The folder of a run.
 
-config-AGENT.json     effective config, which `mapek run` takes as it is
+config-AGENT.json     effective config, as in the manifest, which `mapek run` takes as it is
 manifest.json         what runs, with seeds and versions, those of the user's own modules by their SHA-256; and which
                       command began it, in which folder
 chunks/               finished trials, as they come; gone when the run is complete. Of a trial that failed,
@@ -9,9 +9,13 @@ episodes-AGENT.npz    per-episode table; columns in `adapters.results.table`
 q_tables-AGENT.npz    Q-tables at the end: q_UNIT (actions x states), actions_UNIT (ids of the rows)
 trace-AGENT.npy       steps of the traced episodes of unit 0
 readings-AGENT.npz    what its detectors read at the end of each of them: pass, statistic, alarm (episodes x detectors)
-result.json           what the command found, with the hashes; its presence says that the run is complete
+result.json           what the command found, with the hashes; its presence says that the run is complete. ``files``
+                      holds the SHA-256 of tables and figures
 figures/              PNG and PDF
 log.sqlite            the log, of `up` and `serve`, and of a run over a plant; of several agents log-AGENT.sqlite
+
+manifest.json, result.json and the JSON of a chunk end with the SHA-256 of their other entries; that of a chunk holds
+those of the files beside it.
 
 A unit of work is a trial, or one loop of it: unit ``trial * loops + loop``. What is said of trials below is of units.
 """
@@ -26,6 +30,7 @@ import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -33,9 +38,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from adapters import private
 from adapters.held import held_by
 from adapters.results.chunk import READINGS, read_arrays, read_chunk, remove_parts
-from adapters.results.files import cannot_write, made_again, read_json, read_npz, whole, write_json
+from adapters.results.files import (
+    cannot_write,
+    file_sum,
+    hold,
+    made_again,
+    read_json,
+    read_npz,
+    read_sealed,
+    whole,
+    write_json,
+    write_sealed,
+)
 from adapters.results.own_code import other_versions, own_modules
 from adapters.results.table import read_episodes, read_last, write_npz
 from adapters.stores import LOG_NAME
@@ -46,8 +63,11 @@ from mape.near import did_you_mean, nearest_path
 from mape.tables import first_difference
 from mape.trials import TrialResult
 
-FORMAT = 2
-"""Version of what stands in the folder; an unfinished run of another one is not gone on with."""
+FORMAT = 3
+"""Version of what stands in the folder; another one is not read."""
+
+READERS = {2: "0.2.0.dev0"}
+"""Which mapek reads an older one."""
 
 LOGS_OF_AGENTS = "log-"
 """With what the names of logs begin where a run has several agents."""
@@ -74,8 +94,10 @@ def default_path(name: str) -> Path:
     for n in itertools.count(1):
         path = stem if n == 1 else stem.with_name(f"{stem.name}-{n}")
         try:
-            path.parent.mkdir(exist_ok=True)
-            path.mkdir()  # taken by being made: a name that is looked up first, another process can take meanwhile
+            private.make_folder(path.parent)
+            # Taken by being made: a name that is looked up first, another process can take meanwhile.
+            path.mkdir(mode=private.FOLDER)
+            path.chmod(private.FOLDER)
         except FileExistsError:
             if not path.parent.is_dir():
                 raise ResultsError(
@@ -111,7 +133,21 @@ def read_manifest(path: Path, way_out: str = "name the folder that `mapek` wrote
         ) from error
     if not isinstance(there, dict) or "format" not in there or "agents" not in there:
         raise ResultsError(f"{manifest} is of no run of ours; {way_out}")
-    return there
+    if there["format"] in READERS:
+        reader = READERS[there["format"]]
+        raise ResultsError(
+            f"{path} has a layout of format {there['format']}, and this mapek reads format {FORMAT}; mapek {reader} "
+            f"reads it; {way_out}"
+        )
+    found: dict[str, Any] = read_sealed(manifest)
+    return found
+
+
+def is_summed(path: Path) -> bool:
+    """Whether a file, named from its run's folder, has its checksum in ``result.json``."""
+    if path.parts[0] == "figures":
+        return path.suffix in (".png", ".pdf") and not path.name.startswith(".")
+    return len(path.parts) == 1 and path.name.startswith(("episodes-", "q_tables-", "trace-", "readings-"))
 
 
 def _stems(path: Path, agent: str) -> list[Path]:
@@ -192,8 +228,9 @@ class RunFolder:
         try:
             # Before anything is written there: a folder of someone else's is left as it is.
             self._refuse_foreign()
-            path.mkdir(parents=True, exist_ok=True)
-            self._lock = open(path / ".lock", "a")  # noqa: SIM115 - held until `close`
+            private.make_folder(path)
+            private.refuse_links(path)
+            self._lock = open(path / ".lock", "a", opener=private.opener)  # noqa: SIM115 - held until `close`
         except OSError as error:
             raise cannot_write(path, error) from error
         try:
@@ -226,7 +263,7 @@ class RunFolder:
             remove_parts(self.path)
             self._write_configs(wanted)
             own = own_modules(self.configs.values())
-            write_json(manifest, {**wanted, MODULES: own, "command": self.command, "cwd": os.getcwd()})
+            write_sealed(manifest, {**wanted, MODULES: own, "command": self.command, "cwd": os.getcwd()})
             return
         if (self.path / "result.json").exists():
             raise ResultsError(f"{self.path} holds a finished run, which is left as it is; choose another --out")
@@ -254,7 +291,7 @@ class RunFolder:
         if others:
             then = [{"module": other.module, "sha256": other.then} for other in others]
             own = own_modules(self.configs.values())
-            write_json(manifest, {**there, MODULES: own, MENDED: [*there.get(MENDED, []), *then]})
+            write_sealed(manifest, {**there, MODULES: own, MENDED: [*there.get(MENDED, []), *then]})
 
     def _write_configs(self, wanted: Mapping[str, Any]) -> None:
         for agent in self.configs:
@@ -267,7 +304,7 @@ class RunFolder:
     def chunk_stem(self, agent: str, first: int, count: int) -> str:
         """Return where a chunk's results belong."""
         folder = self.path / "chunks" / agent
-        folder.mkdir(parents=True, exist_ok=True)
+        private.make_folder(folder)
         return str(folder / f"{first:08d}-{first + count - 1:08d}")
 
     def _stems(self, agent: str) -> list[Path]:
@@ -277,7 +314,7 @@ class RunFolder:
         """Return the results of the trials that are on disk, by number."""
         found: dict[int, TrialResult] = {}
         for stem in self._stems(agent):
-            for result in read_chunk(stem) or ():
+            for result in read_chunk(stem, self.configs[agent]) or ():
                 found[self.configs[agent].unit(result.trial, result.loop)] = result
         return found
 
@@ -301,6 +338,7 @@ class RunFolder:
     def q_tables(self, agent: str) -> dict[int, tuple[npt.NDArray[np.float64], tuple[int, ...]]]:
         """Return values and action ids at the end of each trial."""
         path = self.path / f"q_tables-{agent}.npz"
+        hold(path)
         arrays = read_npz(path, made_again(path))
         trials = sorted(int(name[2:]) for name in arrays if name.startswith("q_"))
         return {t: (arrays[f"q_{t}"], tuple(arrays[f"actions_{t}"].tolist())) for t in trials}
@@ -308,22 +346,33 @@ class RunFolder:
     def q_table(self, agent: str, unit: int) -> tuple[npt.NDArray[np.float64], tuple[int, ...]]:
         """Return values and action ids at the end of one trial."""
         path, names = self.path / f"q_tables-{agent}.npz", (f"q_{unit}", f"actions_{unit}")
+        hold(path)
         values, actions = read_npz(path, made_again(path), names).values()
         return values, tuple(actions.tolist())
 
     def trace(self, agent: str) -> npt.NDArray[np.void] | None:
         """Return the traced steps of trial 0, or None where nothing was traced."""
         path = self.path / f"trace-{agent}.npy"
-        return np.load(path, allow_pickle=False) if path.exists() else None
+        if not path.exists():
+            return None
+        hold(path)
+        steps: npt.NDArray[np.void] = np.load(path, allow_pickle=False)
+        return steps
 
     def readings(self, agent: str) -> dict[str, npt.NDArray[Any]]:
         """Return what detectors read in the traced episodes of trial 0: `pass`, `statistic` and `alarm`, by column."""
         path = self.path / f"readings-{agent}.npz"
+        hold(path)
         return read_npz(path, made_again(path))
 
     def finish(self, result: Mapping[str, Any]) -> None:
-        """Write the result, and remove the chunks that are now in the tables."""
-        write_json(self.path / "result.json", {"command": self.command, "versions": versions(), **result})
+        """Write the result, with the checksums of the files that are beside it, and remove the chunks."""
+        kept = [path for path in sorted(self.path.rglob("*")) if is_summed(path.relative_to(self.path))]
+        with ThreadPoolExecutor() as pool:  # which hash side by side
+            sums = dict(zip((str(p.relative_to(self.path)) for p in kept), pool.map(file_sum, kept), strict=True))
+        write_sealed(
+            self.path / "result.json", {"command": self.command, "versions": versions(), **result, "files": sums}
+        )
         shutil.rmtree(self.path / "chunks", ignore_errors=True)
 
     def kept(self) -> str:

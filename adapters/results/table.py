@@ -30,7 +30,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from adapters.results.files import DAMAGE, made_again, whole
+from adapters.results.files import DAMAGE, hold, made_again, whole
 from mape.errors import ResultsError
 
 DTYPE = np.dtype(
@@ -104,7 +104,7 @@ def read_episodes(path: str | Path, columns: Iterable[str] = COLUMNS) -> dict[st
     Raises
     ------
     ResultsError
-        The file is missing, cut short, or has no such column.
+        The file is missing, cut short, or not what its run wrote, or it has no such column.
     """
     with _opened(path, columns) as archive:
         trials, _ = _shape(archive)
@@ -117,7 +117,7 @@ def read_last(path: str | Path, column: str, episodes: int) -> npt.NDArray[Any]:
     Raises
     ------
     ResultsError
-        The file is missing, cut short, or has no such column.
+        The file is missing, cut short, or not what its run wrote, or it has no such column.
     """
     with _opened(path, (column,)) as archive:
         trials, length = _shape(archive)
@@ -131,6 +131,7 @@ def read_last(path: str | Path, column: str, episodes: int) -> npt.NDArray[Any]:
 
 @contextlib.contextmanager
 def _opened(path: str | Path, columns: Iterable[str]) -> Iterator[Any]:
+    hold(Path(path))
     try:
         # Opened here: `np.load` leaves a file that it cannot read open.
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:

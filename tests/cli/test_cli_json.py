@@ -172,7 +172,7 @@ def test_a_file_gets_the_same_json_as_standard_output_and_as_the_folder(
         written, inside = strict_json(file.read()), strict_json(kept.read())
     assert written == piped
     assert {key: inside[key] for key in written} == written
-    assert {"command", "versions"} == set(inside) - set(written)
+    assert {"command", "versions", "files", "sha256"} == set(inside) - set(written)
     assert "results:  out" in to_file.out
 
 

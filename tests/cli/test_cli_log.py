@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from command_line import EXAMPLES, Mapek
-from replay_logs import begin, change, places, small, take, write_free_log, write_log
+from replay_logs import begin, change, places, reseal, small, take, write_free_log, write_log
 
 from adapters.cli.log import Cursor
 from adapters.replay.records import logged
@@ -223,6 +223,7 @@ def test_a_log_without_records_is_said_to_have_none(mapek: Mapek, here: Path, op
 def test_passes_that_an_unfinished_log_does_not_reach_are_said_to_be_missing(mapek: Mapek, log: Path) -> None:
     with Store(log / "log.sqlite") as store:
         store._db.execute("DELETE FROM records WHERE pass > 5")
+    reseal(log / "log.sqlite")
 
     outcome = mapek("log", log, "--pass", "7:9")
     assert (outcome.code, outcome.out) == (1, "")
@@ -336,8 +337,13 @@ class Appearing:
 
     def __init__(self, whole: Path, folder: Path) -> None:
         self._steps: deque[Callable[[], object]] = deque(
-            [lambda: None, folder.mkdir, lambda: shutil.copy(whole, folder / "log.sqlite")]
+            [lambda: None, folder.mkdir, lambda: self._copy(whole, folder)]
         )
+
+    @staticmethod
+    def _copy(whole: Path, folder: Path) -> None:
+        for one in (whole.with_suffix(".mark"), whole):
+            shutil.copy(one, folder)
 
     def sleep(self, seconds: float) -> None:
         assert self._steps, "the reader waits for more than there is"

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from replay_logs import change, places, reseal, small, write_free_log, write_log
+from replay_logs import change, edited, places, reseal, small, write_free_log, write_log
 
 from adapters.cli.main import main
 from adapters.replay.records import LogReplay, Replayed
@@ -352,9 +352,8 @@ def test_replay_ends_with_1_at_a_difference(folder: Path, capsys: pytest.Capture
 def test_a_result_that_says_another_hash_is_a_difference(
     folder: Path, capsys: pytest.CaptureFixture[str], name: str, whole: bool
 ) -> None:
-    result = json.loads((folder / "result.json").read_text())
-    (result if whole else result["trials"][0])[name] = "0" * 64
-    (folder / "result.json").write_text(json.dumps(result))
+    with edited(folder / "result.json") as result:
+        (result if whole else result["trials"][0])[name] = "0" * 64
     capsys.readouterr()
 
     assert main(["replay", str(folder)]) == 1

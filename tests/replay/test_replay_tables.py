@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from replay_logs import SMALL, small
+from replay_logs import SMALL, edited, reseal_files, small
 
 from adapters.cli.main import main
 from adapters.results import COLUMNS
@@ -50,6 +50,7 @@ def set_value(path: Path, name: str, index: Any, value: float) -> None:
         arrays = dict(archive)
     arrays[name][index] = value
     np.savez(path, **arrays)
+    reseal_files(path.parent)
 
 
 @pytest.mark.parametrize("kind", ["run", "compare"])
@@ -96,6 +97,7 @@ def test_a_table_with_fewer_trials_is_a_difference(folders: Path, replay: Any) -
     table = folders / "run" / "episodes-small.npz"
     with np.load(table) as archive:
         np.savez(table, **{name: values[:-12] for name, values in archive.items()})
+    reseal_files(folders / "run")
 
     assert (
         "has 3 trials of 12 episodes there, and 4 trials of 12 episodes here"
@@ -114,10 +116,13 @@ def test_a_q_value_that_was_changed_is_named(folders: Path, replay: Any) -> None
 @pytest.mark.parametrize("where", ["whole", "trial", "agent"])
 def test_a_hash_that_was_changed_is_named(folders: Path, replay: Any, where: str) -> None:
     path = folders / ("compare" if where == "agent" else "run") / "result.json"
-    result = json.loads(path.read_text())
-    entry = {"whole": lambda: result, "trial": lambda: result["trials"][3], "agent": lambda: result["agents"]["one"]}
-    entry[where]()["q_table_sha256"] = "0" * 64
-    path.write_text(json.dumps(result))
+    with edited(path) as result:
+        entry = {
+            "whole": lambda: result,
+            "trial": lambda: result["trials"][3],
+            "agent": lambda: result["agents"]["one"],
+        }
+        entry[where]()["q_table_sha256"] = "0" * 64
 
     said = replay(path.parent, 1)["difference"]
 
@@ -150,9 +155,8 @@ def test_an_unfinished_folder_is_to_be_finished_first(folders: Path, capsys: pyt
 
 def test_other_versions_are_named_beside_a_difference(folders: Path, capsys: pytest.CaptureFixture[str]) -> None:
     set_value(folders / "run" / "q_tables-small.npz", "q_0", (0, 0), 0.125)
-    manifest = json.loads((folders / "run" / "manifest.json").read_text())
-    here, manifest["versions"]["numpy"] = manifest["versions"]["numpy"], "1.0.0"
-    (folders / "run" / "manifest.json").write_text(json.dumps(manifest))
+    with edited(folders / "run" / "manifest.json") as manifest:
+        here, manifest["versions"]["numpy"] = manifest["versions"]["numpy"], "1.0.0"
     capsys.readouterr()
 
     assert main(["replay", str(folders / "run"), "-q", "--workers", "1"]) == 1

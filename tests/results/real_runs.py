@@ -13,6 +13,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from adapters.results.chunk import read_chunk
+from adapters.results.folder import read_manifest
+from mape.config import from_table
+from mape.trials import TrialResult
+
 FROZEN_LAKE = Path(__file__).parents[2] / "examples" / "frozen_lake.toml"
 MAPEK = (sys.executable, "-m", "mape")
 MANY = (
@@ -42,8 +47,15 @@ def leftovers(out: Path) -> list[str]:
 def result_of(out: Path) -> dict[str, Any]:
     """The result of a finished run, without the command line that differs."""
     found: dict[str, Any] = json.loads((out / "result.json").read_bytes())
-    del found["command"]
+    for name in ("command", "sha256"):
+        del found[name]
     return found
+
+
+def results_in(chunk: Path) -> list[TrialResult] | None:
+    """The results of a chunk, named by its JSON."""
+    (config,) = read_manifest(chunk.parents[2])["agents"].values()
+    return read_chunk(chunk.with_suffix(""), from_table(config))
 
 
 def run(*arguments: str, cwd: Path, code: int = 0, start: tuple[str, ...] = MAPEK) -> subprocess.CompletedProcess[str]:

@@ -20,6 +20,7 @@ from real_runs import (
     leftovers,
     little_room,
     result_of,
+    results_in,
     run,
     running,
     wait_for_a_chunk,
@@ -28,7 +29,7 @@ from real_runs import (
 
 from adapters.cli.main import main
 from adapters.results import COLUMNS, read_episodes
-from adapters.results.chunk import read_arrays, read_chunk
+from adapters.results.chunk import read_arrays
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +128,7 @@ def test_sigterm_leaves_nothing_half_written_under_a_final_name(tmp_path: Path) 
     assert not (out / "result.json").exists()
     for chunk in finished_chunks(out):
         # Each says how long its rows are, and what their hash is.
-        assert read_chunk(chunk.with_suffix("")) is not None
+        assert results_in(chunk) is not None
         assert set(read_arrays(chunk.with_suffix(""))) == {f"q_{int(chunk.stem[:8])}", f"actions_{int(chunk.stem[:8])}"}
 
 
@@ -308,7 +309,7 @@ def test_a_trial_that_fails_leaves_the_trials_before_it_and_its_own_passes(tmp_p
     )
     assert code == 1
     chunks = tmp_path / "out" / "chunks" / "gridworld_goals"
-    finished = [trial.trial for stem in chunks.glob("*.json") for trial in read_chunk(stem.with_suffix(""))]
+    finished = [trial.trial for stem in chunks.glob("*.json") for trial in results_in(stem)]
     assert finished == [0, 1]
     with np.load(chunks / "broken-2.npz") as broken:
         assert broken["episode"].tolist() == list(range(1, 51))

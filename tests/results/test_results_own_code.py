@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 from real_runs import contents, result_of, run
+from replay_logs import edited
 
 from adapters.cli.main import main
 
@@ -109,9 +110,8 @@ def test_a_module_that_is_nowhere_any_more_is_said(
     here: Path, stop: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     stop(*RUN, "--out", "out")
-    manifest = json.loads(Path("out/manifest.json").read_text())
-    manifest["modules"]["own_helper"] = sha256("gone")
-    Path("out/manifest.json").write_text(json.dumps(manifest))
+    with edited(Path("out/manifest.json")) as manifest:
+        manifest["modules"]["own_helper"] = sha256("gone")
     capsys.readouterr()
 
     assert main(["resume", "out"]) == 1
@@ -121,9 +121,8 @@ def test_a_module_that_is_nowhere_any_more_is_said(
 
 def test_an_older_manifest_keeps_no_modules_and_its_run_goes_on(here: Path, stop: Callable[..., None]) -> None:
     stop(*RUN, "--out", "out")
-    manifest = json.loads(Path("out/manifest.json").read_text())
-    del manifest["modules"]
-    Path("out/manifest.json").write_text(json.dumps(manifest))
+    with edited(Path("out/manifest.json")) as manifest:
+        del manifest["modules"]
 
     assert main(["resume", "out"]) == 0
 

@@ -27,6 +27,7 @@ from real_runs import (
     wait_for_a_chunk,
     wait_until_gone,
 )
+from replay_logs import edited
 
 from adapters.cli.main import main
 from adapters.results import RunFolder, read_episodes
@@ -221,10 +222,11 @@ def test_a_run_whose_folder_of_then_is_gone_goes_on_from_here(
 
 
 def edit_manifest(folder: Path, **entries: Any) -> None:
-    path = folder / "manifest.json"
-    manifest = {**json.loads(path.read_text()), **entries}
-    gone = {name for name, value in entries.items() if value is None}
-    path.write_text(json.dumps({name: value for name, value in manifest.items() if name not in gone}))
+    with edited(folder / "manifest.json") as manifest:
+        for name, value in entries.items():
+            manifest.pop(name)
+            if value is not None:
+                manifest[name] = value
 
 
 def test_an_older_manifest_does_not_say_the_command_and_still_goes_on_by_out(
@@ -314,7 +316,7 @@ def test_ctrl_c_after_the_trials_names_the_folder_and_how_to_go_on(
 def test_ctrl_c_after_the_result_says_that_all_is_there(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupt(*arguments: object) -> None:
+    def interrupt(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("adapters.cli.common.write_json", interrupt)
