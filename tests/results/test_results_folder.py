@@ -218,7 +218,8 @@ def the_chunk(folder: Path, ending: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("ending", "says"), [(".json", "is damaged"), (".rows", "is cut short"), (".npz", "was changed after it was written")]
+    ("ending", "says"),
+    [(".json", "is damaged"), (".rows", "is cut short"), (".npz", "was changed after it was written")],
 )
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
 def test_a_chunk_that_is_cut_short_is_named_and_runs_again_once_it_is_deleted(
