@@ -136,15 +136,15 @@ class Database:
         for one in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal"))):
             if one.is_symlink():
                 raise ResultsError(f"{one} is a symbolic link, which mapek never makes; name the file it leads to")
-        if path.is_file():
+        if path.is_file() and path.stat().st_size:
             return
         mark = read_mark(path)
         if mark is not None and (readonly or mark.commits):
             raise ResultsError(
-                f"{path} is gone, and {mark_path(path).name} counts {mark.commits:,} commits to it: what was logged is "
+                f"{path} is gone or empty, and {mark_path(path).name} counts {mark.commits:,} commits to it: what was logged is "
                 f"lost. {_WAY_OUT}"
             )
-        if readonly:
+        if readonly and not path.is_file():
             raise ResultsError(f"there is no log {path}; `mapek up` and `mapek serve` write one")
 
     def _check_schema(self) -> None:
