@@ -24,6 +24,9 @@ from mape.errors import ConfigError, PartError, ResultsError
 from mape.near import did_you_mean, nearest_path
 from mape.parts import config_at
 
+ENDINGS = (".sqlite", ".mark")
+"""Of a log, and of its mark: with a mark, and no log, there was one."""
+
 BATCH = 512
 """Records that are held in memory at a time."""
 
@@ -38,12 +41,13 @@ def log_of(path: Path) -> Path | None:
     """
     if path.is_dir():
         private.refuse_links(path)
-        several = sorted(path.glob(f"{LOGS_OF_AGENTS}*.sqlite"))
+        several = sorted(
+            {one.with_suffix(".sqlite") for one in path.glob(f"{LOGS_OF_AGENTS}*") if one.suffix in ENDINGS}
+        )
         if several:
             names = ", ".join(str(log) for log in several)
             raise ConfigError(f"{path} holds a log for each agent; name one of them: {names}")
         log = path / LOG_NAME
-        # With a mark, and no log, there was one.
         return log if log.is_file() or mark_path(log).is_file() else None
     if not path.exists():
         near = nearest_path(path, os.path.exists)

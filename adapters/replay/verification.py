@@ -11,7 +11,7 @@ from adapters import private
 from adapters.replay.records import LogReplay
 from adapters.results.chunk import read_arrays, read_chunk
 from adapters.results.files import changed, file_sum, read_json, read_sealed
-from adapters.results.folder import is_summed, read_manifest
+from adapters.results.folder import LOGS_OF_AGENTS, is_summed, read_manifest
 from adapters.stores import LOG_NAME, Store
 from adapters.stores.mark import mark_path
 from mape.config import from_table
@@ -48,12 +48,14 @@ def verified(folder: Path) -> Iterator[tuple[str, str]]:
     manifest = read_manifest(folder)
     yield "manifest.json", "as it was written"
     yield from _configs(folder, manifest)
-    log, result = folder / LOG_NAME, folder / "result.json"
+    result = folder / "result.json"
     stored = read_sealed(result) if result.is_file() else None
     held = {*NEVER}
-    if log.exists() or mark_path(log).exists() or (manifest["kind"] == "up" and stored is not None):
-        yield LOG_NAME, _log(log, manifest, stored)
-        held |= {LOG_NAME, f"{LOG_NAME}-wal", f"{LOG_NAME}-shm", mark_path(log).name}
+    for agent, config in manifest["agents"].items():
+        log = folder / (LOG_NAME if len(manifest["agents"]) == 1 else f"{LOGS_OF_AGENTS}{agent}.sqlite")
+        if log.exists() or mark_path(log).exists() or (manifest["kind"] == "up" and stored is not None):
+            yield log.name, _log(log, config, stored)
+            held |= {log.name, f"{log.name}-wal", f"{log.name}-shm", mark_path(log).name}
     if stored is None:
         yield from _chunks(folder, manifest, held)
     else:
@@ -76,10 +78,10 @@ def _configs(folder: Path, manifest: Mapping[str, Any]) -> Iterator[tuple[str, s
             yield path.name, "the config in manifest.json"
 
 
-def _log(path: Path, manifest: Mapping[str, Any] | None, stored: Mapping[str, Any] | None) -> str:
+def _log(path: Path, config: Mapping[str, Any] | None, stored: Mapping[str, Any] | None) -> str:
     with Store(path, readonly=True) as store:  # which holds all of it against its sums
         facts = store.facts()
-        if manifest is not None and facts.get("config") not in (None, *manifest["agents"].values()):
+        if config is not None and facts.get("config", config) != config:
             raise ResultsError(f"{path} is the log of a run with another config than manifest.json has")
         if stored is not None:
             _hashes(LogReplay(store), stored)
@@ -88,7 +90,7 @@ def _log(path: Path, manifest: Mapping[str, Any] | None, stored: Mapping[str, An
 
 def _hashes(log: LogReplay, stored: Mapping[str, Any]) -> None:
     """Hold what the run said that it came to against what stands in its log."""
-    for unit, said in enumerate(stored["trials"]):
+    for unit, said in enumerate(stored.get("trials", ())):  # a comparison names only the hash of all
         last = log.store.snapshot(unit, "execute")
         table = None if last is None or last.table is None else last.table.sha256()
         digest = hashlib.sha256(log.layout.schema)
@@ -130,10 +132,9 @@ def _files(folder: Path, stored: Mapping[str, Any], held: set[str]) -> Iterator[
 def _without(
     folder: Path, manifest: Mapping[str, Any], stored: Mapping[str, Any] | None, held: set[str]
 ) -> Iterator[tuple[str, str]]:
-    if manifest["kind"] != "up":
-        yield "no records", f"`mapek {manifest['kind']}` keeps none, so there is no chain to hold"
-    elif LOG_NAME not in held:
-        yield "no records", "nothing has been logged yet"
+    if not any(name.endswith(".sqlite") for name in held):
+        none = "nothing has been logged yet" if manifest["kind"] == "up" else f"`mapek {manifest['kind']}` keeps none"
+        yield "no records", f"{none}, so there is no chain to hold"
     if stored is None:
         yield "no result", "the run is unfinished"
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())

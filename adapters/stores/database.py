@@ -141,8 +141,8 @@ class Database:
         mark = read_mark(path)
         if mark is not None and (readonly or mark.commits):
             raise ResultsError(
-                f"{path} is gone or empty, and {mark_path(path).name} counts {mark.commits:,} commits to it: what was logged is "
-                f"lost. {_WAY_OUT}"
+                f"{path} is gone or empty, and {mark_path(path).name} counts {mark.commits:,} commits to it: what was "
+                f"logged is lost. {_WAY_OUT}"
             )
         if readonly and not path.is_file():
             raise ResultsError(f"there is no log {path}; `mapek up` and `mapek serve` write one")
