@@ -16,7 +16,7 @@ from mape.execute.attempts import Attempts
 from mape.execute.checkpoint import Checkpoint, Held, carried_by, differing, held_by, take_up
 from mape.execute.refusals import broken_off, check_offer, refused
 from mape.execute.rules import rate_array
-from mape.execute.uniforms import Uniforms
+from mape.execute.uniforms import WIDE, Drawn, Reaching, Uniforms
 from mape.execute.workspace import Workspace
 from mape.ports import Episode, Json, Learner, ManagedSystem
 from mape.states import STOPS, faults, told
@@ -111,12 +111,19 @@ class Execute:
         reset_draws, step_draws = system.draws
         cap = system.max_steps
         self._system_draws = reset_draws + cap * step_draws
-        self.uniforms = Uniforms(seed, (loop, trial), self._system_draws + 2 * cap)
+        width = self._system_draws + 2 * cap
+        self.uniforms: Uniforms | Drawn | Reaching
+        if width <= WIDE:
+            self.uniforms = Uniforms(seed, (loop, trial), width)
+        elif self.rules is None:
+            self.uniforms = Drawn(seed, (loop, trial), width)
+        else:
+            self.uniforms = Reaching(seed, (loop, trial), reset_draws, step_draws, cap)
 
         self._workspace = Workspace(cap, self.rules is None or getattr(self.rules, "legal", None) is not None)
         self._context = np.zeros(len(system.signal_names))
         self._no_trace = np.empty((0, len(episode.TRACE_COLUMNS)))
-        self._limits = (mask_greedy, reset_draws, step_draws, cap)
+        self._limits = (mask_greedy, reset_draws, step_draws)
         self._called = drive.Called(system)
         self._target: Any = self._called if self.rules is None else self.rules.params
         self.available: tuple[int, ...] = ()
@@ -245,7 +252,7 @@ class Execute:
         tracing = number in self._traced
         trace = np.empty((self.system.max_steps, len(episode.TRACE_COLUMNS))) if tracing else self._no_trace
         try:
-            status, steps, total, td_error, change = self._drive(number, plan.epsilon, at, trace, *self._fixed)
+            status, steps, total, td_error, change = self._driven(number, plan.epsilon, at, trace)
         except BaseException as error:
             self._workspace.roll_back()
             contract = isinstance(error, (ManagedSystemError, PartError))
@@ -297,6 +304,22 @@ class Execute:
             self._workspace.roll_back()
             raise
 
+    def _driven(self, *arguments: Any) -> tuple[int, int, float, float, float]:
+        """Drive an episode; one that comes to the end of the uniforms that are held is driven again with more."""
+        uniforms = self.uniforms
+        if not isinstance(uniforms, Reaching):
+            return self._drive(*arguments, *self._fixed)
+        while True:
+            if self._reached is not uniforms.values:
+                self._fix_arguments()
+            found = self._drive(*arguments, *self._fixed)
+            if not uniforms.further(found[1]):
+                break
+            self._workspace.roll_back()
+            self._workspace.forget()
+        uniforms.settle(found[1])
+        return found
+
     def quiet_until(self, last: int) -> int:
         """Return the pass, `last` at most, up to which all episodes are alike.
 
@@ -305,6 +328,8 @@ class Execute:
         """
         plan, number = self.plan, self.passes + 1
         if self.rules is None or plan is None or plan.reset_detector or number in self._traced:
+            return self.passes
+        if isinstance(self.uniforms, Reaching):  # how far it has to reach, each episode finds out by itself
             return self.passes
         available = self.system.available(number)
         if available is not self.available or set(self.available) != set(self.q_table.actions):
@@ -430,6 +455,7 @@ class Execute:
         return binding.by_rules(self.rules, learner, (1, 0.5, 0, self._no_trace, *self._arguments(learner)))
 
     def _fix_arguments(self) -> None:
+        self._reached = self.uniforms.values
         self._fixed = self._arguments(self.learner)
 
     def _arguments(self, learner: Learner) -> tuple[Any, ...]:
@@ -444,6 +470,7 @@ class Execute:
             learner.bootstrap_terminal,
             bool(getattr(learner, "on_policy", True)),  # one that does not say so gets what it may need
             *self._limits,
+            self.uniforms.reach if isinstance(self.uniforms, Reaching) else self.system.max_steps,
         )
 
     def _begin_first(self, number: int) -> None:
@@ -460,7 +487,7 @@ class Execute:
         seed, *key = self._seeds
         sequence = np.random.SeedSequence(entropy=seed, spawn_key=(*key, number))
         self.attempts.on_begin(number)
-        block = self.uniforms.values[at : at + self._system_draws].copy()  # a system may keep what it is told
+        block = self.uniforms.block(at, self._system_draws)  # a copy: a system may keep what it is told
         told = Episode(number, int(sequence.generate_state(1)[0]), block)
         try:
             state, available = self.system.begin(told)

@@ -70,7 +70,9 @@ class Stretches:
         self._before = np.zeros_like(self._state)
         self._params = np.zeros(max(1, int(self._bounds[-1, 3])))
         self._told = np.zeros(2, dtype=np.int64)
-        most = len(execute.uniforms.values) // execute.uniforms.width
+        values = execute.uniforms.values
+        assert isinstance(values, np.ndarray)  # there are rules
+        most = len(values) // execute.uniforms.width
         self._heads = np.zeros((most + 1, self._log.layout.head))
         self._integers = self._heads.view(np.int64)
         self._directions = np.zeros((most, len(self._watched)), dtype=np.int64)
@@ -111,7 +113,7 @@ class Stretches:
             if count < 1:
                 return False
             at = execute.uniforms.find(execute.passes)
-            blocks = (len(execute.uniforms.values) - at) // execute.uniforms.width
+            blocks = self._blocks(at)
             status = self._make(min(count, blocks, room), at)
             if status == passes.BROKEN:
                 return False
@@ -121,6 +123,12 @@ class Stretches:
                 execute.observe(int(signals[1]), dict(zip(names, signals, strict=True)))
                 return True
         return True
+
+    def _blocks(self, at: int) -> int:
+        """Return how many blocks of uniforms are held from `at` on."""
+        values = self._execute.uniforms.values
+        assert isinstance(values, np.ndarray)
+        return (len(values) - at) // self._execute.uniforms.width
 
     def _take(self, table: QTable) -> None:
         self._table = table  # one of a single row has another type in compiled code than one of several
