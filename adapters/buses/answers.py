@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import zenoh
 
+from adapters.buses import pieces
 from adapters.buses.messages import (
     Acknowledged,
     Control,
@@ -21,12 +22,12 @@ from adapters.buses.messages import (
     Table,
 )
 from adapters.buses.presence import Presence
-from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, OF_CONFIG, SINCE_LIMIT
+from adapters.buses.wire import LARGEST_MESSAGE, LARGEST_TABLE, MISSING, OF_CONFIG, SINCE_LIMIT
 from adapters.roles import ROLES, STAGE_OF
 from adapters.stores.begun import begins, begun, breaks_off, failures
 from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import Snapshot, Swap
-from knowledge import STAGES, Ack, MalformedRecord
+from knowledge import STAGES, Ack, MalformedRecord, QTable, from_json
 from mape.errors import BusError
 from mape.parts import owner
 from mape.specs import PartSpec
@@ -45,6 +46,9 @@ class Answer(NamedTuple):
     query: zenoh.Query
     payload: bytes
     published: tuple[str, int, bytes] | None = None
+
+
+_WHOLE = b"whole="
 
 
 class Relay(NamedTuple):
@@ -96,6 +100,8 @@ class Answers:
         self._seal = seal
         self._proof = proof
         self._fetch_table = fetch_table
+        self._given = pieces.Given()
+        self._gathered = {role: pieces.Gathered(LARGEST_TABLE) for role in ROLES}
 
     # What roles send.
 
@@ -120,12 +126,27 @@ class Answers:
         if data.startswith(b'{"schema":"Dropped/'):
             return self._drop(query, loop, stage, data)
         # Its episode can be driven only once: the state is written together with the record, or neither is.
-        state, table = State.unpack(behind) if behind else (None, None)
+        state, table = self._behind(role, loop, stage, data, behind)
         ack, last = self._ledger.take(loop, stage, data)
         if ack is Ack.OK and state is not None:
             self._ledger.keep(role, Snapshot(loop, role, state.pass_no, state.state, table), stage)
         said = b'{"schema":"Acknowledged/1","ack":"%s","last":%d}' % (ack.value.encode(), last)
         return Answer(query, said, (role, loop, data) if ack is Ack.OK else None)
+
+    def _behind(
+        self, role: str, loop: int, stage: int, data: bytes, behind: bytes
+    ) -> tuple[State, QTable | None] | tuple[None, None]:
+        """Return the state that is to be written with a record; of one that is written already there is none."""
+        if behind.startswith(_WHOLE):
+            whole = behind.removeprefix(_WHOLE).decode("ascii", "replace")
+            found = self._gathered[role].whole(whole)
+            if found is None:
+                if from_json(data).pass_no > self._ledger.last(loop)[stage]:
+                    raise _missing(whole)
+                return None, None
+            self._gathered[role].forget(whole)
+            behind = found
+        return State.unpack(behind) if behind else (None, None)
 
     def _drop(self, query: zenoh.Query, loop: int, stage: int, data: bytes) -> Answer:
         dropped, _ = Dropped.unpack(data)
@@ -167,6 +188,8 @@ class Answers:
             return self._table(query)
         if what == "snapshot":
             return self._snapshot(query, role)
+        if what == "piece" and role in STAGE_OF:
+            return self._piece(query, role)
         if what == "remember" and role == "plan":
             return self._remember(query)
         if what == "swap":
@@ -236,43 +259,85 @@ class Answers:
             stages[_whole(stage, "a stage of `from`")] = _whole(number, "a pass of `from`")
         if max(stages) >= len(STAGES):
             raise ValueError(f"stage is {max(stages)}; the stages of a pass are numbered from 0 to {len(STAGES) - 1}")
-        return Answer(query, "\n".join([str(loop), *self._ledger.since(loop, stages, SINCE_LIMIT)]).encode())
+        found = self._ledger.since(loop, stages, SINCE_LIMIT)
+        fits, size = 0, 0
+        while fits < len(found) and (fits < len(STAGES) or size + len(found[fits]) < pieces.PIECE):
+            size += len(found[fits])
+            fits += 1
+        more = fits < len(found) or len(found) == SINCE_LIMIT
+        return Answer(query, "\n".join([f"{loop} {int(more)}", *found[:fits]]).encode())
+
+    # What may be too large for one message.
+
+    def give(self, query: zenoh.Query, data: bytes) -> Answer:
+        """Answer by `data`, or by the first piece of it."""
+        return Answer(query, self._given.answer(data))
+
+    def _further(self, query: zenoh.Query) -> Answer | None:
+        """Answer who asks for a further piece of what was given before; None where that is to be made anew."""
+        whole = query.parameters.get("whole")
+        if whole is None or query.parameters.get("at") is None:
+            return None
+        found = self._given.further(whole, _whole(query.parameters.get("at"), "at"))
+        return None if found is None else Answer(query, found)
+
+    def _piece(self, query: zenoh.Query, role: str) -> Answer:
+        self._check_epoch(role, _attachment(query))
+        return Answer(query, b"%d" % self._gathered[role].take(_payload(query, LARGEST_MESSAGE)))
+
+    def _told(self, query: zenoh.Query, role: str) -> bytes:
+        """Return what was told, in this message or in pieces before it."""
+        whole = query.parameters.get("whole")
+        if whole is None:
+            return _payload(query, LARGEST_MESSAGE)
+        found = self._gathered[role].whole(whole)
+        if found is None:
+            raise _missing(whole)
+        return found
 
     def _snapshot(self, query: zenoh.Query, role: str) -> Answer:
         if role not in STAGE_OF:
             raise Refusal(f"role {role!r} has no state; the roles are {', '.join(ROLES)}")
-        if query.payload is None:
+        kept_in_pieces = query.parameters.get("whole") is not None and query.parameters.get("at") is None
+        if query.payload is None and not kept_in_pieces:
+            if (further := self._further(query)) is not None:
+                return further
             found = self._ledger.store.snapshot(_whole(query.parameters.get("loop"), "loop"), role)
             if found is None:
                 return Answer(query, b"")
             state = State(loop=found.loop, pass_no=found.pass_no, state=found.state, final=found.final)
-            return Answer(query, state.pack(found.table))
+            return self.give(query, state.pack(found.table))
         self._check_epoch(role, _attachment(query))
-        state, table = State.unpack(_payload(query, LARGEST_TABLE))
+        state, table = State.unpack(self._told(query, role))
         snapshot = Snapshot(self._loop(state.loop), role, state.pass_no, state.state, table, state.final)
         ack, last = self._ledger.keep(role, snapshot, STAGE_OF[role])
+        self._gathered[role].forget(query.parameters.get("whole") or "")
         return Answer(query, Acknowledged(ack=ack.value, last=last).pack())  # type: ignore[arg-type]
 
     def _table(self, query: zenoh.Query) -> Answer | None:
+        if (further := self._further(query)) is not None:
+            return further
         key = query.parameters.get("sha256")
         if key is not None:
             table = self._ledger.store.table(key)
             if table is None:
                 raise LookupError(f"no Q-table {key[:12]}... is remembered")
-            return Answer(query, Table(loop=None, pass_no=None).pack(table))
+            return self.give(query, Table(loop=None, pass_no=None).pack(table))
         loop = self._loop(_whole(query.parameters.get("loop"), "loop"))
         number = _whole(query.parameters.get("pass"), "pass")
         table = self._ledger.store.version(loop, number)
         if table is not None:
-            return Answer(query, Table(loop=loop, pass_no=number).pack(table))
+            return self.give(query, Table(loop=loop, pass_no=number).pack(table))
         self._fetch_table(query, loop, number)
         return None
 
     def _remember(self, query: zenoh.Query) -> Answer:
-        _, table = Table.unpack(_payload(query, LARGEST_TABLE))
+        _, table = Table.unpack(self._told(query, "plan"))
         if table is None:
             raise MalformedRecord("a Q-table to remember stands behind its message")
-        return Answer(query, self._ledger.store.keep_table(table, remembered=True).encode())
+        key = self._ledger.store.keep_table(table, remembered=True)
+        self._gathered["plan"].forget(query.parameters.get("whole") or "")
+        return Answer(query, key.encode())
 
     def _swap(self, query: zenoh.Query) -> Relay:
         control, _ = Control.unpack(_payload(query, LARGEST_MESSAGE))
@@ -374,6 +439,10 @@ def _normal(to: dict[str, Any]) -> dict[str, Any]:
     return normal
 
 
+def _missing(whole: str) -> Refusal:
+    return Refusal(f"{MISSING}not all pieces of {whole[:12]} have come")
+
+
 def _payload(query: zenoh.Query, largest: int) -> bytes:
     payload = query.payload
     if payload is None:
@@ -385,8 +454,8 @@ def _payload(query: zenoh.Query, largest: int) -> bytes:
 
 def _attachment(query: zenoh.Query) -> bytes:
     attachment = query.attachment
-    if attachment is not None and len(attachment) > LARGEST_TABLE:
-        raise MalformedRecord(f"an attachment of {len(attachment)} bytes; at most {LARGEST_TABLE} are taken")
+    if attachment is not None and len(attachment) > LARGEST_MESSAGE:
+        raise MalformedRecord(f"an attachment of {len(attachment)} bytes; at most {LARGEST_MESSAGE} are taken")
     return b"" if attachment is None else bytes(attachment.to_bytes())
 
 

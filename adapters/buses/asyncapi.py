@@ -13,7 +13,9 @@ from knowledge.records import json_schemas
 _SYSTEM, _LOOP = "system", "loop"
 """What stands for the parameters while a key expression is made by the same code that the processes use."""
 
-_STATE = "its raw bytes stand behind the line where a Q-table belongs to it"
+_STATE = (
+    "its raw bytes stand behind the line where a Q-table belongs to it; what is larger than a piece comes in pieces"
+)
 
 
 def document() -> dict[str, Any]:
@@ -61,7 +63,8 @@ def document() -> dict[str, Any]:
         for what, said, asked, answered in (
             ("join", "who I am, with which config", ("Join",), ("Joined",)),
             ("snapshot", f"keep my state, or, without a payload, give it back; {_STATE}", ("State",),
-             ("Acknowledged", "State")),
+             ("Acknowledged", "State", "Piece")),
+            ("piece", "a part of a large State or Table; answered with how many bytes there are", ("Piece",), ()),
             ("swapped", "a part was replaced", ("Swapped",), ()),
             ("event", "note this beside the records", ("Happened",), ()),
         ):  # fmt: skip
@@ -71,16 +74,16 @@ def document() -> dict[str, Any]:
             wire.control(role),
             f"query by Knowledge, answered by {role}",
             ("Control",),
-            ("Replaced", "Table"),
+            ("Replaced", "Table", "Piece"),
         )
         channel(f"beat-{role}", wire.beat(role), f"published by {role}: its heartbeat", ("Beat",))
         channel(f"alive-{role}", wire.alive(role, "{epoch}"), f"liveliness token of {role}", ())
     text = "query by an operator: have another part put in; Knowledge hands it on to the role whose part it is"
     channel("swap", wire.ask("swap"), text, ("Control",), ("Replaced",))
     kinds = tuple(stage.__name__ for stage in STAGES)
-    text = "query with ?loop=L;from=STAGE:PASS,...: the number of the loop, then records, one a line"
+    text = "query with ?loop=L;from=STAGE:PASS,...: the loop and whether there is more, then records, one a line"
     channel("since", wire.ask("since"), text, (), kinds)
-    channel("table", wire.ask("table"), "query with ?sha256=... or ?loop=L;pass=N: a Q-table", (), ("Table",))
+    channel("table", wire.ask("table"), "query with ?sha256=... or ?loop=L;pass=N: a Q-table", (), ("Table", "Piece"))
     text = f"query by plan: keep this Q-table; {_STATE}; answered with its SHA-256"
     channel("remember", wire.ask("remember/plan"), text, ("Table",))
     channel("status", wire.ask("status"), "query: who is there, and how far the run is", (), ("Status",))

@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import zenoh
 
+from adapters.buses import pieces
 from adapters.buses.answers import Answer, Answers, Relay
 from adapters.buses.messages import (
     Control,
@@ -27,16 +28,13 @@ from adapters.buses.wire import (
     hand_over,
 )
 from adapters.stores.ledger import Ledger
-from knowledge import MalformedRecord
-from mape.errors import MapekError, ResultsError
+from knowledge import MalformedRecord, QTable
+from mape.errors import BusError, MapekError, ResultsError
 
 logger = logging.getLogger(__name__)
 
 AT_ONCE = 1024
 """Most questions that are answered with one commit."""
-
-TABLE_WITHIN = 5.0
-"""Seconds that Execute has to hand out a Q-table."""
 
 
 SWAPPED_WITHIN = 60.0
@@ -100,6 +98,7 @@ class KnowledgeHub:
             proof=wire.proof,
             fetch_table=self._fetch_table,
         )
+        self._fetching: set[tuple[int, int]] = set()  # loop and pass of the Q-tables that Execute is asked for
         self._leave: Callable[..., object] | None = None
         self._worker: threading.Thread | None = None
         self._session: zenoh.Session | None = None
@@ -222,7 +221,7 @@ class KnowledgeHub:
             elif kind == "table":
                 query, number, loop, table = what
                 self.ledger.store.keep_version(loop, number, table)
-                answers.append(Answer(query, Table(loop=loop, pass_no=number).pack(table)))
+                answers.append(self.answers.give(query, Table(loop=loop, pass_no=number).pack(table)))
             elif kind == "swap refused":
                 self.answers.refused(what)
             elif kind:
@@ -271,30 +270,51 @@ class KnowledgeHub:
                     return
 
     def _fetch_table(self, query: zenoh.Query, loop: int, number: int) -> None:
+        if (loop, number) in self._fetching:  # who asks again is answered once it is here
+            with suppress(zenoh.ZError), query:
+                query.reply_err("later: it is being fetched")
+            return
+        self._fetching.add((loop, number))
         # Execute may itself be waiting for the worker.
         threading.Thread(target=self._ask_execute, args=(query, loop, number), daemon=True).start()
 
     def _ask_execute(self, query: zenoh.Query, loop: int, number: int) -> None:
-        said = f"Execute did not hand out its Q-table of pass {number}"
-        control = Control(what="q_table", loop=loop, pass_no=number).pack()
+        try:
+            table = self._table_of_execute(loop, number)
+        except (BusError, MalformedRecord) as error:
+            with suppress(zenoh.ZError), query:
+                query.reply_err(f"later: {error}")
+        else:
+            self._asked.put(("table", (query, number, loop, table)))
+        finally:
+            self._fetching.discard((loop, number))
+
+    def _table_of_execute(self, loop: int, number: int) -> QTable:
+        parts, found = pieces.Assembled(), None
+        while found is None:
+            further = {"whole": parts.whole, "at": parts.at} if parts.whole else {}
+            control = Control(what="q_table", loop=loop, pass_no=number, **further)  # type: ignore[arg-type]
+            found = parts.take(self._answer_of_execute(control))
+        _, table = Table.unpack(found)
+        if table is None:
+            raise MalformedRecord("Execute answered without the Q-table that it was asked for")
+        return table
+
+    def _answer_of_execute(self, control: Control) -> bytes:
+        said = f"Execute did not hand out its Q-table of pass {control.pass_no}"
         assert self._session is not None
         with suppress(zenoh.ZError):
             for reply in self._session.get(
-                self.wire.control("execute"), payload=control, attachment=self._seal, timeout=TABLE_WITHIN
+                self.wire.control("execute"),
+                payload=control.pack(),
+                attachment=self._seal,
+                timeout=self.wire.patience,
+                **ORDERED,
             ):
-                if reply.ok is None:
-                    said = reply.err.payload.to_string() if reply.err is not None else said
-                    continue
-                try:
-                    _, table = Table.unpack(reply.ok.payload.to_bytes())
-                except MalformedRecord as error:
-                    said = str(error)
-                    continue
-                if table is not None:
-                    self._asked.put(("table", (query, number, loop, table)))
-                    return
-        with suppress(zenoh.ZError), query:
-            query.reply_err(f"later: {said}")
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload.to_bytes())
+                said = reply.err.payload.to_string() if reply.err is not None else said
+        raise BusError(said)
 
 
 def _leave_unanswered(asked: tuple[str, Any] | None) -> None:

@@ -10,7 +10,7 @@ import zenoh
 
 from adapters.buses.questions import ANSWER_WITHIN
 from adapters.buses.round_trip import RoundTrip
-from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, SINCE_LIMIT, Wire
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Wire
 from knowledge import STAGES, MalformedRecord, Record, from_json
 from mape.errors import BusError
 
@@ -115,8 +115,8 @@ class Inbox:
         self._nothing_new.pop(record.loop, None)
         self._take(record)
 
-    def caught_up(self, loop: int, lines: Sequence[bytes]) -> None:
-        """Take an answer to what was asked: records of a loop, in order."""
+    def caught_up(self, loop: int, lines: Sequence[bytes], more: bool) -> None:
+        """Take an answer to what was asked: records of a loop, in order, and whether the log has more of them."""
         now, news = time.monotonic(), False
         if (asked := self._fetched.pop(loop, None)) is not None:
             self._round_trip.took(now - asked)
@@ -130,7 +130,7 @@ class Inbox:
                 news = True
         self._nothing_new[loop] = 0 if news else self._nothing_new.get(loop, 0) + 1
         # An answer that was read late, after its question was asked again, asks for no more.
-        if news and len(lines) >= SINCE_LIMIT and loop in self._next:
+        if news and more and loop in self._next:
             self._fetch(loop)
 
     def keep_up(self, now: float) -> None:

@@ -19,12 +19,14 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
+from adapters.buses import pieces
 from adapters.buses.inbox import Inbox
+from adapters.buses.keeping import Keeping
 from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout, State
 from adapters.buses.outbox import Outbox
 from adapters.buses.questions import Questions, Refused
 from adapters.buses.round_trip import RoundTrip
-from adapters.buses.wire import INPUT, LARGEST_MESSAGE, ORDERED, Unanswered, Wire, hand_over, host, role_of
+from adapters.buses.wire import INPUT, LARGEST_MESSAGE, MISSING, ORDERED, Unanswered, Wire, hand_over, host, role_of
 from adapters.roles import KNOWLEDGE, STAGE_OF
 from knowledge import MalformedRecord, QTable, Record, to_json
 from mape.errors import BusError
@@ -92,13 +94,14 @@ class Member(Questions):
         self.refused = 0
         self.passes = 0  # for the heartbeat: what all loops together have done
         self.vouched: Callable[[], bool] = lambda: True  # whether who does the work is alive, if on another thread
-        self._woken = False
+        self._woken = self._missing = False
         self._config, self._versions, self._layout = dict(config or {}), dict(versions or {}), layout
         self._arrived: SimpleQueue[Any] = SimpleQueue()  # filled by Zenoh's threads, and by nobody else
         self._waiting: deque[Record | Asked] = deque()
         # Neither knows this Member: who lets go of it has it freed, and closed, at once.
         self._inbox = Inbox(wire, role, hand_over(self._arrived, "since"), self._waiting.append, self._round_trip)
         self._outbox = Outbox(wire, role, hand_over(self._arrived, "ack"), self._round_trip)
+        self._keeping = Keeping(wire, role, self._arrived, self._round_trip)
         self._kept_up_at = self._beat_at = 0.0
         self._leave: Callable[..., object] | None = None
 
@@ -124,7 +127,7 @@ class Member(Questions):
             opened.callback(
                 session.declare_queryable(self.wire.control(self.role), hand_over(self._arrived, "control")).undeclare
             )
-            self._inbox.get = self._outbox.get = session.get
+            self._inbox.get = self._outbox.get = self._keeping.get = session.get
             self._beats = session.declare_publisher(self.wire.beat(self.role), **ORDERED)
             # Knowledge's token comes again with each new link to it: what was on its way over the last one is lost.
             knowledge = self.wire.alive(KNOWLEDGE)
@@ -142,7 +145,7 @@ class Member(Questions):
         """Leave; what was not acknowledged may be lost, unless `settle` was called."""
         if self._leave is not None:
             self._leave()
-        self._session = self._inbox.get = self._outbox.get = None
+        self._session = self._inbox.get = self._outbox.get = self._keeping.get = None
 
     def __enter__(self) -> Self:
         self.connect()
@@ -191,7 +194,7 @@ class Member(Questions):
         self._inbox.seal = self.joined.seal.encode()
         for loop, last in enumerate(self.joined.last):
             self._outbox.begin(loop, last[STAGE_OF[self.role]])
-        self._epoch = str(self.joined.epoch).encode()
+        self._epoch = self._keeping.epoch = str(self.joined.epoch).encode()
 
     def _lost(self) -> None:
         """Take note that a question was lost; where all are, and yet the link stands, open another session.
@@ -220,6 +223,7 @@ class Member(Questions):
         """Send and ask again what was under way over a link that is gone."""
         self._outbox.send_all_again()
         self._inbox.ask_again()
+        self._keeping.ask_again()
 
     # Sending.
 
@@ -244,8 +248,13 @@ class Member(Questions):
             raise BusError(
                 f"{type(record).__name__} {record.pass_no} cannot be written for the wire: {error}"
             ) from error
-        behind = self._epoch if state is None else self._epoch + b"\n" + state.pack(table)
-        self._outbox.put(record.loop, record.pass_no, payload, behind)
+        behind = b"" if state is None else state.pack(table)
+        if len(behind) > pieces.PIECE:
+            whole = self._hand_over(behind).encode()
+            attachment = self._epoch + b"\nwhole=" + whole
+        else:
+            attachment, behind = self._epoch + (b"\n" + behind if behind else b""), b""
+        self._outbox.put(record.loop, record.pass_no, payload, attachment, behind)
 
     def drop(self, loop: int, first: int, last: int) -> None:
         """Say that episodes of a free-running loop will not be logged."""
@@ -271,6 +280,27 @@ class Member(Questions):
                 raise BusError(f"Knowledge on {self.wire.endpoint} did not acknowledge what {self.role} sent in time")
             self._take_in(left)
             self._keep_up(time.monotonic())
+            if self._missing:
+                self._hand_over_again()
+
+    def keep(self, state: State, table: QTable | None = None) -> None:
+        """Have a state kept; that it got lost does no harm, as another one will follow."""
+        self._keeping.put(state, table)
+
+    def _between(self) -> None:
+        now = time.monotonic()
+        self._take_in(0.0)
+        if now >= self._kept_up_at:
+            self._keep_up(now)
+        if now >= self._beat_at and self.vouched():
+            self.beat()
+
+    def _hand_over_again(self) -> None:
+        """Hand over what belongs to records and is not at Knowledge any more, and send these again."""
+        self._missing = False
+        for loop, data in self._outbox.behind.items():
+            self._hand_over(data)
+            self._outbox.send_again(loop)
 
     def _acknowledged(self, reply: zenoh.Reply) -> None:
         ok = reply.ok
@@ -283,6 +313,9 @@ class Member(Questions):
 
     def _unanswered(self, reply: zenoh.Reply) -> None:
         said = reply.err.payload.to_string() if reply.err is not None else "Timeout"
+        if said.startswith(MISSING):
+            self._missing = True
+            return
         if said != "Timeout":  # Zenoh's own word; everything else was said by Knowledge
             raise Refused(f"{self.role} is refused by Knowledge: {said}")
         self._lost()
@@ -313,6 +346,8 @@ class Member(Questions):
                 self.beat(waiting=not self._waiting)
             if now >= self._kept_up_at:
                 self._keep_up(now)
+            if self._missing:
+                self._hand_over_again()
             if self._waiting:
                 if not self._arrived.empty():
                     self._take_in(0.0)  # acknowledgements do not wait until there is nothing else to do
@@ -342,6 +377,8 @@ class Member(Questions):
                     self._acknowledged(what)
                 elif kind == "since":
                     self._caught_up(what)
+                elif kind == "kept":
+                    self._keeping.answered(*what)
                 elif kind == "woken":
                     pass
                 elif kind == "knowledge":
@@ -384,14 +421,16 @@ class Member(Questions):
         if self._outbox.keep_up(now):
             self._lost()
         self._inbox.keep_up(now)
+        self._keeping.keep_up(now)
 
     def _caught_up(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
             self._unanswered(reply)
             return  # it is asked again after a while
         self._deaf_since = None
-        loop, *lines = reply.ok.payload.to_bytes().splitlines()
-        self._inbox.caught_up(int(loop), lines)
+        head, *lines = reply.ok.payload.to_bytes().splitlines()
+        loop, more = head.split()
+        self._inbox.caught_up(int(loop), lines, more != b"0")
 
     # Answering, and being alive.
 

@@ -179,6 +179,14 @@ class Table(Message):
     pass_no: Number | None
 
 
+class Piece(Message):
+    """A part of a message too large for one: `size` bytes with the hash `whole`, of which those from `at` on follow."""
+
+    whole: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    size: Number
+    at: Number
+
+
 class Beat(Message):
     """The thread that does a role's work is alive; `passes` are those of all its loops together."""
 
@@ -195,6 +203,7 @@ class Control(Message):
     Roles are asked by Knowledge alone. It keeps who of the operators wants which part, and hands the question on.
 
     One whose answer was lost is asked again with the same `question`, any text of its own, and is not answered anew.
+    Of a Q-table too large for one message each further piece is asked for by `whole` and `at`, as `Piece` names them.
     """
 
     what: Literal["swap", "q_table"]
@@ -203,6 +212,8 @@ class Control(Message):
     question: Name | None = None
     loop: Number | None = None
     pass_no: Number | None = None
+    whole: Name | None = None
+    at: Number | None = None
 
 
 class Replaced(Message):
@@ -244,5 +255,5 @@ class Status(Message):
 
 
 MESSAGES: tuple[type[Message], ...] = (
-    Acknowledged, Beat, Control, Dropped, Happened, Join, Joined, Replaced, State, Status, Swapped, Table,
+    Acknowledged, Beat, Control, Dropped, Happened, Join, Joined, Piece, Replaced, State, Status, Swapped, Table,
 )  # fmt: skip

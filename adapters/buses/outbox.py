@@ -29,6 +29,7 @@ class _Sent(NamedTuple):
     payload: bytes
     attachment: bytes
     at: float
+    behind: bytes = b""  # what is too large to be sent with it, and is handed over before
     again: bool = False
 
 
@@ -62,8 +63,10 @@ class Outbox:
         """Take note of the last record of a loop that Knowledge had when this role joined."""
         self._kept.setdefault(loop, last)
 
-    def put(self, loop: int, number: int, payload: bytes, attachment: bytes) -> None:
+    def put(self, loop: int, number: int, payload: bytes, attachment: bytes, behind: bytes = b"") -> None:
         """Send the record `number` of a loop, again until it is acknowledged.
+
+        What stands `behind` it was handed over in pieces; it is held as long as it may have to be again.
 
         Raises
         ------
@@ -73,7 +76,7 @@ class Outbox:
         waiting = self._sent.get(loop)
         if waiting is None:
             waiting = self._sent[loop] = deque()
-        waiting.append(_Sent(number, payload, attachment, time.monotonic()))
+        waiting.append(_Sent(number, payload, attachment, time.monotonic(), behind))
         self._transmit(loop, payload, attachment)
 
     @property
@@ -131,6 +134,15 @@ class Outbox:
         if in_vain:
             self._round_trip.in_vain()
         return in_vain
+
+    @property
+    def behind(self) -> dict[int, bytes]:
+        """Return per loop what belongs to the first record that is not acknowledged, where that is large."""
+        return {loop: waiting[0].behind for loop, waiting in self._sent.items() if waiting and waiting[0].behind}
+
+    def send_again(self, loop: int) -> None:
+        """Send the first record of a loop again, now that what belongs to it has been handed over."""
+        self._send_again(loop, time.monotonic(), 1)
 
     def send_all_again(self) -> None:
         """Send again what was on its way over a link that is gone."""

@@ -10,9 +10,10 @@ from typing import Any
 
 import zenoh
 
+from adapters.buses import pieces
 from adapters.buses.messages import Happened, State, Swapped, Table
 from adapters.buses.round_trip import RoundTrip
-from adapters.buses.wire import OF_CONFIG, ORDERED, Wire
+from adapters.buses.wire import MISSING, OF_CONFIG, ORDERED, Wire
 from knowledge import QTable, Record, from_json
 from mape.errors import BusError, ConfigError
 
@@ -24,6 +25,10 @@ _UNHEARD: Any = zenoh.handlers.Callback(lambda reply: None, indirect=False)
 
 class Refused(BusError):
     """Knowledge said no; to ask again would not change it."""
+
+
+class Missing(Refused):
+    """Knowledge does not have the pieces of what was said to consist of them."""
 
 
 class Questions(ABC):
@@ -49,6 +54,10 @@ class Questions(ABC):
     @abstractmethod
     def _lost(self) -> None:
         """Take note that a question was lost."""
+
+    @abstractmethod
+    def _between(self) -> None:
+        """Do, between two pieces of something large, what is not to wait for all of it."""
 
     def _say(self, sentence: str) -> None:
         if sentence != self._told:
@@ -92,6 +101,8 @@ class Questions(ABC):
                     self._round_trip.took(time.monotonic() - asked_at)
                     return bytes(reply.ok.payload.to_bytes())
                 outcome = "Timeout" if reply.err is None else reply.err.payload.to_string()
+                if outcome.startswith(MISSING):
+                    raise Missing(outcome)
                 if outcome.startswith(OF_CONFIG):
                     raise ConfigError(outcome.removeprefix(OF_CONFIG))
                 if outcome != "Timeout" and not outcome.startswith("later: "):
@@ -110,26 +121,42 @@ class Questions(ABC):
             tick.wait(pause)
             pause = min(2 * pause, 0.2)
 
+    def ask_whole(self, what: str) -> bytes:
+        """Ask Knowledge for what may be too large for one message, piece after piece."""
+        parts = pieces.Assembled()
+        found = parts.take(self.ask(what))
+        while found is None:
+            self._between()
+            found = parts.take(self.ask(f"{what}{';' if '?' in what else '?'}whole={parts.whole};at={parts.at}"))
+        return found
+
+    def tell_whole(self, what: str, data: bytes) -> bytes:
+        """Tell Knowledge what may be too large for one message; return its answer."""
+        if len(data) <= pieces.PIECE:
+            return self.ask(what, data, self._epoch)
+        while True:
+            whole = self._hand_over(data)
+            try:
+                return self.ask(f"{what}?whole={whole}", None, self._epoch)
+            except Missing:
+                pass  # it was started again in between
+
+    def _hand_over(self, data: bytes) -> str:
+        """Give Knowledge all pieces of a message, and return by what it names it."""
+        whole, at = pieces.sha256(data), 0
+        while at < len(data):
+            at = int(self.ask(f"piece/{self.role}", pieces.cut(data, whole, at), self._epoch))
+            self._between()
+        return whole
+
     def snapshot(self, loop: int) -> tuple[State, QTable | None] | None:
         """Return this role's newest state of a loop, or None where it has none."""
-        found = self.ask(f"snapshot/{self.role}?loop={loop}")
+        found = self.ask_whole(f"snapshot/{self.role}?loop={loop}")
         return State.unpack(found) if found else None
-
-    def keep(self, state: State, table: QTable | None = None) -> None:
-        """Have a state kept; that it got lost does no harm, as another one will follow."""
-        self._mention(f"snapshot/{self.role}", state.pack(table), self._epoch)
-
-    def _mention(self, what: str, payload: bytes, attachment: bytes | None = None) -> None:
-        """Ask Knowledge once, and do not wait for the answer."""
-        if self._session is None:
-            raise BusError(f"{self.role} is not connected; call connect()")
-        self._session.get(
-            self.wire.ask(what), _UNHEARD, payload=payload, attachment=attachment, timeout=self.wire.patience, **ORDERED
-        )
 
     def keep_surely(self, state: State, table: QTable | None = None) -> None:
         """Have a state kept, and wait for the answer."""
-        self.ask(f"snapshot/{self.role}", state.pack(table), self._epoch)
+        self.tell_whole(f"snapshot/{self.role}", state.pack(table))
 
     def swapped(self, swap: Swapped) -> None:
         """Have it kept that a part was replaced; from its pass on every restart uses the new one."""
@@ -142,8 +169,13 @@ class Questions(ABC):
         what, payload = f"event/{self.role}", Happened(kind=kind, text=text, loop=loop, pass_no=number).pack()
         if surely:
             self.ask(what, payload, self._epoch)
-        else:
-            self._mention(what, payload, self._epoch)
+            return
+        if self._session is None:
+            raise BusError(f"{self.role} is not connected; call connect()")
+        self._session.get(
+            self.wire.ask(what), _UNHEARD, payload=payload, attachment=self._epoch, timeout=self.wire.patience,
+            **ORDERED,
+        )  # fmt: skip
 
     def history(self, loop: int, stages: Mapping[int, int]) -> list[Record]:
         """Return the records of the stages named, each from its pass on; as many as fit into one answer."""
@@ -152,11 +184,11 @@ class Questions(ABC):
 
     def table(self, which: str) -> QTable:
         """Return a Q-table, by ``sha256=...`` or by ``loop=...;pass=...``."""
-        _, table = Table.unpack(self.ask(f"table?{which}"))
+        _, table = Table.unpack(self.ask_whole(f"table?{which}"))
         if table is None:
             raise BusError("Knowledge answered without the Q-table that it was asked for")
         return table
 
     def remember(self, table: QTable) -> str:
         """Have a Q-table kept for a later plan; return its hash."""
-        return self.ask("remember/plan", Table(loop=None, pass_no=None).pack(table)).decode()
+        return self.tell_whole("remember/plan", Table(loop=None, pass_no=None).pack(table)).decode()

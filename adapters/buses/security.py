@@ -52,6 +52,7 @@ RIGHTS = (
     Right("query", "mape/*/*/append/{role}", STAGES),
     Right("query", "mape/*/knowledge/join/{role}", STAGES),
     Right("query", "mape/*/knowledge/snapshot/{role}", STAGES),
+    Right("query", "mape/*/knowledge/piece/{role}", STAGES),
     Right("query", "mape/*/knowledge/swapped/{role}", STAGES),
     Right("query", "mape/*/knowledge/event/{role}", STAGES),
     Right("query", "mape/*/knowledge/remember/plan", ("plan",)),

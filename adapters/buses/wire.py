@@ -5,6 +5,7 @@
     mape/<system>/knowledge/join/<role>          query: I am <role>, with this config; what is my epoch?
     mape/<system>/knowledge/since                query: the records of a loop from a pass on
     mape/<system>/knowledge/snapshot/<role>      query: keep my state; or, without a payload, give it back
+    mape/<system>/knowledge/piece/<role>         query: a piece of what is too large for one message
     mape/<system>/knowledge/swap                 query: have another part put in; handed on to the role whose part it is
     mape/<system>/knowledge/swapped/<role>       query: from this pass on I work with the part that was asked for
     mape/<system>/knowledge/event/<role>         query: note this beside the records
@@ -57,13 +58,16 @@ ORDERED: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, 
 """Put and query options. Zenoh keeps order within one priority only, and drops by default when a link is busy."""
 
 LARGEST_MESSAGE = 1 << 20
-"""Bytes of the largest message without a Q-table that is taken; the largest that a run sends is some tens of kB."""
+"""Bytes of the largest message that is taken; the largest that a run sends, a piece among them, is some tens of kB."""
 
 LARGEST_TABLE = 1 << 30
-"""Bytes of the largest message with a Q-table that is taken."""
+"""Bytes of the largest message that is taken in pieces: a state, or a Q-table."""
 
 SINCE_LIMIT = 512
 """Most records in one answer to `since`; a shorter answer reaches the end of the log."""
+
+MISSING = "missing: "
+"""What a refusal begins with of a message whose pieces Knowledge does not have, since its restart say."""
 
 OF_CONFIG = "config: "
 """What a refusal begins with that is a matter of the config."""

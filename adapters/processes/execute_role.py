@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from adapters.buses.member import Asked, Member
 from adapters.buses.messages import State, Table
+from adapters.buses.pieces import Given
 from adapters.processes.detached import Brought, Detached
 from adapters.processes.pulse import Pulse
 from adapters.processes.replacing import Unit, Wanted, reason
@@ -56,6 +57,7 @@ class ExecuteRole(Role):
         self._pulse = Pulse(lambda: self.member, self._driven, hang_after)
         self.systems = systems
         self.free = config.execute.mode == "free"
+        self._given = Given()
 
     def run(self) -> None:
         """Join, restore, and work until all loops are done, or `stopping` is set; then close the systems.
@@ -270,6 +272,9 @@ class ExecuteRole(Role):
     def hand_out(self, asked: Asked) -> None:
         """Hand out the Q-table at the end of the episode that is asked for, which is the last one in lockstep."""
         control = asked.control
+        if control.whole is not None and (further := self._given.further(control.whole, control.at or 0)) is not None:
+            self.member.answer(asked, further)
+            return
         if not 0 <= (control.loop or 0) < len(self.units):
             raise BusError(f"loop {control.loop}; this run has loops 0 to {len(self.units) - 1}")
         unit = self.units[control.loop or 0]
@@ -277,7 +282,7 @@ class ExecuteRole(Role):
         if asked_for > passes or (asked_for < passes and not self.free):
             raise BusError(f"Execute is at pass {unit.component.passes}, not at the end of {control.pass_no}")
         table = unit.component.q_table.copy()
-        self.member.answer(asked, Table(loop=unit.loop, pass_no=control.pass_no).pack(table))
+        self.member.answer(asked, self._given.answer(Table(loop=unit.loop, pass_no=control.pass_no).pack(table)))
 
 
 class FreeExecuteRole(ExecuteRole):

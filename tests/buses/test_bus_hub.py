@@ -309,9 +309,9 @@ def test_the_records_since_a_pass_come_up_to_a_limit(site, raw, joined, monkeypa
         role = ("execute", "monitor", "analyze", "plan")[[type(r) for r in run_of(1)[1:]].index(type(record))]
         append(raw, site.wire, role, to_json(record))
     reply, _ = ask(raw, site.wire.ask("since") + "?loop=0;from=0:1,3:0")
-    assert reply.splitlines() == [b"0", to_json(plan(0)), to_json(observation(1)), to_json(plan(1))]
+    assert reply.splitlines() == [b"0 1", to_json(plan(0)), to_json(observation(1)), to_json(plan(1))]
     reply, _ = ask(raw, site.wire.ask("since") + "?loop=0;from=2:3")
-    assert reply == b"0"
+    assert reply == b"0 0"
 
 
 def test_whatever_system_is_there_answers_an_operator_under_its_own_name(site):

@@ -6,7 +6,7 @@ import pytest
 from bus_peers import Site, ask, eventually, lose, of, received, serve_questions, status
 from bus_records import TOLD, new_ledger, observation, plan, run_of, symptom
 
-from adapters.buses import Member, answers, hub, inbox, member
+from adapters.buses import Member, answers, hub, member
 from adapters.buses.member import Asked
 from adapters.buses.messages import Control, State, Swapped
 from adapters.buses.questions import Refused
@@ -72,8 +72,7 @@ def test_a_record_is_sent_on_without_waiting_for_the_one_before(site, all_four):
 
 @pytest.mark.parametrize("limit", [1, 2, 512])
 def test_who_joins_late_gets_all_from_where_it_asks_for_it(site, monkeypatch, limit):
-    for module in (answers, inbox):
-        monkeypatch.setattr(module, "SINCE_LIMIT", limit)
+    monkeypatch.setattr(answers, "SINCE_LIMIT", limit)
     site.everybody()
     site.send(*run_of(5))
     late = site.member("plan")

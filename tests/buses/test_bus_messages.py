@@ -18,6 +18,7 @@ from adapters.buses.messages import (
     Happened,
     Join,
     Joined,
+    Piece,
     Replaced,
     RoleStatus,
     State,
@@ -37,6 +38,7 @@ EXAMPLES = [
     Happened(kind="swap refused", text="no", loop=0, pass_no=3),
     Join(role="execute", config={"a": [1, None, {"b": 0.5}]}, versions={"wire": "1"}, pid=1, host="h", layout=TOLD),
     Joined(epoch=1, seal="s", units=2, layout=TOLD, last=((0, 0, 0, -1), (1, 1, 1, 1)), swaps=(SWAPPED,), begun=(0, 3)),
+    Piece(whole="0" * 64, size=9, at=3),
     State(loop=0, pass_no=3, state={"deep": [1, 2.5, "x"]}, final=True),
     Status(
         system="s", name="n", mode="free", episodes=9, units=1, passes=3, last=("", "", "", "{}"),

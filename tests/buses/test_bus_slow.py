@@ -12,8 +12,7 @@ from knowledge import STAGES, to_json
 
 def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):
     passes, limit = 512, 64
-    for module in (answers, inbox):
-        monkeypatch.setattr(module, "SINCE_LIMIT", limit)
+    monkeypatch.setattr(answers, "SINCE_LIMIT", limit)
     # One answer takes it longer than it waits for an answer, and longer than silence lasts.
     monkeypatch.setattr(inbox, "ANSWER_WITHIN", 0.05)
     monkeypatch.setattr(inbox, "SILENCE", 0.02)
