@@ -144,7 +144,7 @@ def test_a_system_that_exits_at_its_reset_is_named():
 
 
 def test_a_learner_that_exits_in_an_episode_is_an_error_of_that_episode():
-    with pytest.raises(ManagedSystemError, match=f"raised {EITHER}: 5, in episode 1"):
+    with pytest.raises(PartError, match=f"step_size of learner Learner raised {EITHER}: 5, in episode 1"):
         loop_of(config(execute={"engine": "python"}, learner={"name": "own:Learner"})).run(2)
 
 
