@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from adapters.cli.common import config_of, finish, looking, open_folder, prepare, say
-from adapters.cli.run import aborted_as_json
+from adapters.cli.run import aborted_as_json, say_untaught
 from adapters.experiments.decimals import number, resolution
 from adapters.experiments.pairing import Pairing, pairing
 from adapters.experiments.runner import run_agents
@@ -66,6 +66,8 @@ def execute(chosen: argparse.Namespace) -> int:
         for agent, how in pairings.items():
             if how.kind == "apart":
                 say(chosen, f"\n{agent} is not held against {first}: {how.reason}. Two systems have no common scale.")
+        for agent, config in configs.items():
+            say_untaught(chosen, config, results[agent], folder, agent)
         if (few := of_few(configs[first].trials)) is not None and against:
             say(chosen, f"\n{few}")
         figures = []

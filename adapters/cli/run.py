@@ -13,8 +13,9 @@ from adapters.cli.sentences import sentence
 from adapters.experiments.decimals import plain
 from adapters.experiments.runner import run_agents
 from adapters.experiments.statistics import summary
+from adapters.results import RunFolder
 from adapters.systems.lending import Lender
-from knowledge import STAGES, Record
+from knowledge import STAGES, QTable, Record
 from mape.config import Config
 from mape.errors import ConfigError
 from mape.loop import Loop
@@ -46,6 +47,7 @@ def execute(chosen: argparse.Namespace) -> int:
         )[label]
         result = as_json(config, results)
         report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
+        say_untaught(chosen, config, results, folder, label)
         figures = []
         if not chosen.no_figures:
             from adapters.experiments.pictures import pictures_of_run
@@ -102,6 +104,26 @@ def say_aborted(chosen: argparse.Namespace, config: Config, results: list[TrialR
         say(chosen, f"          {unit}episode {number}: {why}")
 
 
+def say_untaught(
+    chosen: argparse.Namespace, config: Config, results: list[TrialResult], folder: RunFolder, agent: str
+) -> None:
+    """Print how many units learned nothing, where any did: those whose Q-table ends as a fresh one, all zeros."""
+    values, actions = folder.q_table(agent, 0)
+    fresh = QTable(actions, values.shape[1]).sha256()
+    if not (untaught := sum(r.q_table_sha256 == fresh for r in results)):
+        return
+    of = "" if config.units == 1 else f" in {untaught:,} of {config.units:,} {_units(config)}"
+    say(
+        chosen,
+        f"learned:  nothing{of}: no reward but 0 was met, and the Q-table of {agent} is as it began. More exploration "
+        "(plan.schedule), longer episodes (system.max_steps) or more of them may meet one",
+    )
+
+
+def _units(config: Config) -> str:
+    return "trials" if config.loops == 1 else "loops of all trials"
+
+
 def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult], last: npt.NDArray[Any]) -> None:
     """Print what came out; `last` are the returns of the last episodes of each unit, NaN where one was dropped."""
     steps = summary(np.array([r.total_steps for r in results]))
@@ -114,7 +136,7 @@ def report(chosen: argparse.Namespace, config: Config, results: list[TrialResult
     for swap, handed_over in zip(config.swap, results[0].handed_over, strict=True):
         say(chosen, swap_sentence(swap, handed_over))
     say_aborted(chosen, config, results)
-    unit, units = ("trial", "trials") if config.loops == 1 else ("loop", "loops of all trials")
+    unit, units = "trial" if config.loops == 1 else "loop", _units(config)
     of_all = f" (of all {units})" if config.units > 1 else ""
     if config.units == 1:
         say(chosen, f"steps:    {results[0].total_steps:,} in total")

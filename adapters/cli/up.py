@@ -16,7 +16,7 @@ from adapters.buses import tokens
 from adapters.buses.endpoints import check_endpoint
 from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, finish, open_folder, prepare, say, wire_of
-from adapters.cli.run import as_json, report
+from adapters.cli.run import as_json, report, say_untaught
 from adapters.cli.sentences import sentence
 from adapters.cli.terminal import cleaned
 from adapters.experiments.runner import check
@@ -82,6 +82,7 @@ def conclude(chosen: argparse.Namespace, config: Config, label: str, folder: Run
             for s in live
         ]
     report(chosen, config, results, folder.last_episodes(label, "return", min(100, config.episodes)))
+    say_untaught(chosen, config, results, folder, label)
     for swap in live:
         loop = f", loop {swap.loop}" if config.units > 1 else ""
         say(chosen, f"swapped:  {swap.part} is {json.dumps(swap.spec)} from pass {swap.pass_no} on{loop}")
