@@ -23,6 +23,7 @@ from mape.errors import ConfigError
 from mape.execute import Execute
 from mape.execute.component import SIGNALS
 from mape.monitor import Monitor
+from mape.near import did_you_mean, nearest
 from mape.parts import make, owner
 from mape.plan import Plan
 from mape.ports import Json, ManagedSystem
@@ -43,8 +44,10 @@ def layout_of(config: Config, system: ManagedSystem) -> RowLayout:
     signals = SIGNALS + system.signal_names
     for detector in config.monitor.detectors:
         if detector.signal not in signals:
+            near = did_you_mean(nearest(detector.signal, signals))
             raise ConfigError(
-                f"detector {detector.name!r} watches signal {detector.signal!r}; {system.name} has {', '.join(signals)}"
+                f"detector {detector.name!r} watches signal {detector.signal!r}; {system.name} has "
+                f"{', '.join(signals)}{near}"
             )
     learner = make("learner", config.learner)
     return _layout(signals, len(config.monitor.detectors), len(learner.rate_names), config.system.max_actions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -72,6 +73,10 @@ def explain(error: ValidationError, prefix: str, model: type[BaseModel]) -> str:
             message = f"no such option{hint} Legal: {', '.join(legal) or 'none'}"
         elif problem["type"] == "missing":
             message = "is needed and missing"
+        elif problem["type"] == "literal_error":
+            legal = re.findall("'([^']*)'", message)
+            message = f"{problem['input']!r} is not legal{did_you_mean(nearest(str(problem['input']), legal))} "
+            message += f"Legal: {', '.join(legal)}"
         elif problem["type"] != "value_error":
             given = problem.get("input")
             message = f"{message[:1].lower()}{message[1:]}, got {'a table' if isinstance(given, dict) else repr(given)}"

@@ -13,6 +13,7 @@ from mape.config import Config, SwapConfig
 from mape.errors import ConfigError, MapekError, PartError
 from mape.execute import Execute
 from mape.monitor import Monitor
+from mape.near import did_you_mean, nearest
 from mape.parts import make, owner, parts_in, place_of, with_part
 from mape.plan import Plan
 from mape.specs import PartSpec
@@ -66,7 +67,10 @@ def replace_part(
             place = int(place_of(part, config).removeprefix("monitor."))
             signal = spec.model_dump(exclude_unset=True).get("signal", component.detectors[place][0])
             if signals is not None and signal not in signals:
-                raise ConfigError(f"detector {spec.name!r} watches signal {signal!r}; the run has {', '.join(signals)}")
+                near = did_you_mean(nearest(signal, signals))
+                raise ConfigError(
+                    f"detector {spec.name!r} watches signal {signal!r}; the run has {', '.join(signals)}{near}"
+                )
             return component.replace(place, signal, new)
         if isinstance(component, Analyze):
             return component.replace(new)

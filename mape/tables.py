@@ -51,6 +51,8 @@ def merge(base: Table, over: Table) -> Table:
     {'plan': {'name': 'morphin', 'k': 6}}
     >>> merge({"plan": {"name": "morphin", "k": 5}}, {"plan": "q_learning"})
     {'plan': 'q_learning'}
+    >>> merge({"detectors": ["adwin", {"name": "oracle"}]}, {"detectors": {"0": {"delta": 0.01}}})
+    {'detectors': [{'name': 'adwin', 'delta': 0.01}, {'name': 'oracle'}]}
     """
     return base | {key: _lay(base[key], value) if key in base else value for key, value in over.items()}
 
@@ -58,11 +60,18 @@ def merge(base: Table, over: Table) -> Table:
 def _lay(base: Any, over: Any) -> Any:
     if isinstance(base, str) and isinstance(over, dict):
         base = {"name": base}
+    if isinstance(base, list) and isinstance(over, dict) and over and all(_counts(key, base) for key in over):
+        # By number, as `monitor.detectors.0.threshold=50` names them.
+        return [_lay(one, over[str(i)]) if str(i) in over else one for i, one in enumerate(base)]
     if not isinstance(base, dict) or not isinstance(over, dict):
         return over
     if any(key in base and key in over and base[key] != over[key] for key in ("name", "id")):
         return over  # another part or system: the options of the one before mean nothing to it
     return merge(base, over)
+
+
+def _counts(key: str, entries: list[Any]) -> bool:
+    return key in map(str, range(len(entries)))
 
 
 def parse_override(text: str) -> Table:

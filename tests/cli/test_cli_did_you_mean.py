@@ -63,6 +63,9 @@ NEARLY = [
     ("run mine.toml --set execute.mode=lock_step", "lockstep"),
     ("run mine.toml --set system.id=FrozenLke-v1", "FrozenLake-v1"),
     ("run mine.toml --set system.options.map_nam=4x4", "map_name"),
+    ("run mine.toml --set 'plan.respond_to=[\"drfit\"]'", "drift"),
+    ('run mine.toml --set \'monitor.detectors=[{name="two_window", signal="retrun"}]\'', "return"),
+    ("run gridworld_goals --set monitor.detectors.0.treshold=50", "threshold"),
     ("run extending.toml", "frozen_lake"),
     (f"swap plann q_learning {NOBODY}", "plan"),
     (f"swap plan.shedule constant {NOBODY}", "plan.schedule"),
@@ -104,9 +107,14 @@ def test_what_was_meant_is_asked(names: Path, mapek: Mapek, line: str, meant: st
 
 
 def test_a_part_that_is_built_in_is_looked_at_before_anybody_is_asked_and_ones_own_where_it_runs(
-    names: Path, mapek: Mapek
+    mapek: Mapek, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = "somebody was connected to"
+
+    def refuse(*arguments: object) -> None:
+        raise BusError(asked)
+
+    monkeypatch.setattr("adapters.cli.swap.operator", refuse)
     for to in ("q_learning", "nowhere:Class", '{name = "nowhere:Class", alhpa = 3}', '{name = "morphin", alpha = 0.2}'):
         assert asked in mapek("swap", "plan", to, *NOBODY.split()).err
     assert asked in mapek("swap", "monitor", '{name = "two_window", signal = "x"}', *NOBODY.split()).err

@@ -47,6 +47,17 @@ plan = { schedule = { decay = 0.25 } }
 """
 
 
+def test_an_entry_of_a_list_is_overridden_by_its_number():
+    from mape import load
+
+    config = load("gridworld_goals", overrides=["monitor.detectors.0.threshold=50.0"])
+    (detector,), (before,) = config.monitor.detectors, load("gridworld_goals").monitor.detectors
+    assert detector.options == {**before.options, "threshold": 50.0}
+    for number in ("1", "-1", "00", "x"):
+        with pytest.raises(ConfigError, match=r"monitor\.detectors: .*a table"):
+            load("gridworld_goals", overrides=[f"monitor.detectors.{number}.threshold=50.0"])
+
+
 def test_what_a_file_leaves_out_has_its_default(file):
     config = load(file('episodes = 5\n[system]\nid = "x"'))
     assert (config.trials, config.seed, config.name, config.plan.name) == (1, 0, "run", "morphin")
@@ -274,7 +285,7 @@ def changed(**over):
             changed(monitor={"detectors": ["page_hinkly"]}),
             "unknown detector 'page_hinkly'; did you mean 'page_hinkley'",
         ),
-        (changed(execute={"engine": "fast"}), "engine 'fast' is not one of auto, compiled, python"),
+        (changed(execute={"engine": "fast"}), "unknown engine 'fast'. Known: auto, compiled, python"),
         ({"system": {"id": "x"}}, "episodes: is needed and missing"),
         ({"episodes": 3}, "system: is needed and missing"),
     ],
@@ -461,7 +472,7 @@ def one_swap(number=3, part="plan", to="morphin", **over):
         ),
         (changed(loops=0), "loops: .*greater than or equal to 1"),
         (changed(loops=4097), "loops: .*less than or equal to 4096"),
-        (changed(execute={"mode": "fast"}), "mode 'fast' is not one of lockstep, free"),
+        (changed(execute={"mode": "fast"}), "unknown mode 'fast'. Known: free, lockstep"),
         (changed(execute={"mode": "free"}), "mode 'free' needs a rate: .*episodes per second"),
         (changed(execute={"mode": "free", "rate": 0.0}), "greater than 0"),
         (changed(execute={"rate": 3.0}), "rate = 3.0 paces a free-running system; in lockstep each episode waits"),

@@ -25,7 +25,7 @@ FORBIDDEN = {
 EXCEPTION = ("mape/__main__.py", "mapek")
 PACKAGES = [
     "knowledge", "managed_systems", "mape", "mape.monitor", "mape.analyze", "mape.plan", "mape.execute",
-    "adapters.detectors", "adapters.systems",
+    "adapters.systems",
 ]  # fmt: skip
 
 
