@@ -86,7 +86,10 @@ class SystemConfig(PartConfig):
     id: str = Field(min_length=1)
     options: dict[str, Any] = Field(default_factory=dict, description="keyword arguments of the environment")
     max_steps: int | None = Field(
-        None, ge=1, le=1_000_000, description="longest episode; needed where the system has no cap"
+        None,
+        ge=1,
+        le=1_000_000,
+        description="longest episode; at most the system's own cap, and needed where it has none",
     )
     max_actions: int = Field(64, ge=1, le=4096, description="largest number of actions that the records can hold")
     discretise: BoxGrid | None = None

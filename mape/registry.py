@@ -7,7 +7,7 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -195,6 +195,17 @@ def options_of(kind: str, spec: PartSpec, where: str) -> tuple[Any, Any]:
     return part, spec.options
 
 
+def _refuse_unread(kind: str, spec: Any, names: Iterable[str]) -> None:
+    """Refuse what a config says of a part of this part, a planner's schedule, where that takes none."""
+    for name in names:
+        said = getattr(spec, name, None)
+        if said is not None and said != type(spec).model_fields[name].get_default(call_default_factory=True):
+            raise ConfigError(
+                f"{kind} {spec.name!r} takes no {name}, and the config gives it {said.name!r}, which nothing would "
+                f"read. Leave it out, or let the class take an argument {name}"
+            )
+
+
 def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
     """Make a part; `extra` (a planner's schedule) is passed on by name where the part takes it.
 
@@ -209,6 +220,7 @@ def build(kind: str, spec: PartSpec, **extra: Any) -> Any:
             made = part(options, **extra)
         else:
             taken = {name: value for name, value in extra.items() if name in inspect.signature(part).parameters}
+            _refuse_unread(kind, spec, extra.keys() - taken.keys())
             made = part(**options, **taken)
         missing = [value for value in VALUES.get(kind, ()) if not hasattr(made, value)]
     except ConfigError:

@@ -188,7 +188,9 @@ class GymnasiumSystem:
             answer: Any = self.env.reset(seed=episode.seed, options=options)
         except faults() as error:
             answers.refuse_old_api(self.name, error)
-            raise self._strict(error) from error
+            if (strict := self._strict(error)) is None:
+                raise
+            raise strict from error
         seen, info = answers.reset_answer(self.name, answer)
         self._actions = self._action_range()
         self._hard = "legal_actions" in info
@@ -344,10 +346,10 @@ class GymnasiumSystem:
                 "terminal; one action at least is legal there, such as one that waits"
             )
 
-    def _strict(self, error: BaseException) -> BaseException:
-        """Return an error of the reset, with the way out where it may be about what the reset was given."""
+    def _strict(self, error: BaseException) -> ManagedSystemError | None:
+        """Return an error with the way out where what the reset raised may be about what it was given, or None."""
         if not any(word in str(error) for word in ("option", "episode", "uniforms", "seed", "keyword")):
-            return error
+            return None
         return ManagedSystemError(
             f"{self.name} raised {told(error)} from reset(), which was given {' and '.join(self._takes) or 'nothing'}. "
             "If it takes less, name what it takes: system.reset_takes = ['seed'], or []"

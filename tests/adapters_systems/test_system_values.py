@@ -292,6 +292,17 @@ def test_the_api_of_before_gymnasium_026_is_named_whatever_stands_around_the_env
         assert "episode 1" in told
 
 
+def test_what_a_reset_raises_has_no_circle_among_its_causes(system_of):
+    class Stuck(Answers):
+        def reset(self, *, seed=None, options=None):
+            raise RuntimeError("the valve is stuck")
+
+    loop = Loop(from_table({"name": "one", "episodes": 1, "system": {"id": "any"}}), system_of(Stuck))
+    with pytest.raises(ManagedSystemError, match="the valve is stuck") as error:
+        loop.run(1)
+    assert error.value.__cause__.__cause__ is None
+
+
 class Unseeded(Answers):
     def reset(self):
         return super().reset(options={"episode": 1})

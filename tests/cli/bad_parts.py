@@ -47,6 +47,13 @@ class Picky(Quiet):
         raise ValueError(f"size {size} is odd")
 
 
+class Unscheduled(Morphin):
+    Config = None
+
+    def __init__(self):
+        super().__init__(MorphinConfig(), Exponential(ExponentialConfig()))
+
+
 class Planned(Morphin):
     Config = None
 

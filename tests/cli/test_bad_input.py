@@ -144,6 +144,15 @@ CASES = [
     sets("an engine that is none", 2, "execute.engine=gpu", "'gpu'", "auto, compiled, python"),
     # parts
     sets("an unknown detector", 2, 'monitor.detectors=["page_hinkly"]', "'page_hinkly'", "did you mean 'page_hinkley'"),
+    sets(
+        "a schedule for a planner that takes none",
+        2,
+        'plan={name="bad_parts:Unscheduled", schedule={name="constant", epsilon=0.1}}',
+        "'bad_parts:Unscheduled'",
+        "no schedule",
+        "'constant'",
+        "Leave it out",
+    ),
     sets("an unknown planner", 2, "plan=morfin", "'morfin'", "did you mean 'morphin'"),
     sets("an unknown schedule", 2, "plan.schedule=exponentail", "'exponentail'", "did you mean 'exponential'"),
     sets("an unknown learner", 2, "learner=sarsa", "'sarsa'", "expected_sarsa", "module:Class"),
