@@ -21,6 +21,7 @@ from adapters.buses.messages import (
     Control,
     Table,
 )
+from adapters.buses.pace import PACE, Pace
 from adapters.buses.presence import Presence
 from adapters.buses.wire import (
     ORDERED,
@@ -60,6 +61,8 @@ class KnowledgeHub:
         Versions of what must be equal in all processes.
     snapshot_every
         Passes from one state that a role has kept to the next: what it does again, at most, after a crash.
+    requests
+        Questions of a kind and role a second; see `adapters.buses.pace`.
 
     Raises
     ------
@@ -74,8 +77,10 @@ class KnowledgeHub:
         config: Mapping[str, Any] | None = None,
         versions: Mapping[str, str] | None = None,
         snapshot_every: int = 100,
+        requests: int = PACE,
     ) -> None:
         self.ledger = ledger
+        self.requests = requests
         self.wire = wire
         self.failure: ResultsError | None = None
         self.ended = threading.Event()  # the run is complete, or the worker has failed
@@ -122,8 +127,20 @@ class KnowledgeHub:
             self._worker = worker = threading.Thread(target=self._work, name="knowledge", daemon=True)
             worker.start()
             opened.callback(self._finish, worker)
-            for kind, key in (("append", self.wire.append("*")), ("knowledge", self.wire.ask("**"))):
-                queryable = session.declare_queryable(key, hand_over(self._asked, kind), complete=True)
+            pace = Pace(
+                lambda query: self._asked.put(("knowledge", query)),
+                lambda query: _leave_unanswered(("knowledge", query)),
+                self.requests,
+                self.ledger.units,
+            )
+            pace.start()
+            opened.callback(pace.stop)
+            asked = zenoh.handlers.Callback(pace.hear, indirect=False)
+            for key, handler in (
+                (self.wire.append("*"), hand_over(self._asked, "append")),
+                (self.wire.ask("**"), asked),
+            ):
+                queryable = session.declare_queryable(key, handler, complete=True)
                 opened.callback(queryable.undeclare)
             beats = session.declare_subscriber(self.wire.beat("*"), hand_over(self._asked, "beat"))
             opened.callback(beats.undeclare)

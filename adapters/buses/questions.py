@@ -51,6 +51,15 @@ class Questions(ABC):
         self._round_trip = RoundTrip(wire.patience)
         self._deaf_since: float | None = None  # the first question that was lost, of those since the last answer
 
+    def _check_size(self, *parts: bytes | None) -> None:
+        """Refuse to send what would be thrown away on the other side without a word."""
+        size = sum(len(part) for part in parts if part is not None)
+        if size > self.wire.largest:
+            raise BusError(
+                f"{self.role} has a message of {size:,} bytes, and at most {self.wire.largest:,} are taken: give "
+                f"--largest-message {(size >> 20) + 2} to all processes of the run"
+            )
+
     @abstractmethod
     def _lost(self) -> None:
         """Take note that a question was lost."""
@@ -88,6 +97,7 @@ class Questions(ABC):
             raise BusError(f"{self.role} is not connected; call connect()")
         if deadline is None and self.patience is not None:
             deadline = time.monotonic() + self.patience
+        self._check_size(payload, attachment)
         key = self.wire.ask_any(what) if any_system else self.wire.ask(what)
         pause, tick = 0.005, threading.Event()
         while True:

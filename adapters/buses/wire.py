@@ -60,6 +60,9 @@ ORDERED: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.BLOCK, 
 LARGEST_MESSAGE = 1 << 20
 """Bytes of the largest message that is taken; the largest that a run sends, a piece among them, is some tens of kB."""
 
+LARGEST = 128 << 20
+"""Bytes of the largest message that a process takes in; what is larger is thrown away before it is whole."""
+
 LARGEST_TABLE = 1 << 30
 """Bytes of the largest message that is taken in pieces: a state, or a Q-table."""
 
@@ -124,6 +127,8 @@ class Wire:
     token
         File of the run's token, by which both ends prove who they are where there are no certificates; None for the one
         in the user's runtime folder, under the endpoint's name.
+    largest
+        Bytes of the largest message that is taken in here.
 
     Raises
     ------
@@ -143,6 +148,7 @@ class Wire:
     insecure: bool = False
     patience: float = PATIENCE
     token: Path | None = None
+    largest: int = LARGEST
 
     def __post_init__(self) -> None:
         if self.system != "*":
@@ -320,7 +326,7 @@ class Wire:
         lease, most = round(self.lease * 1000), round(self.patience * 1000)
         far = not self.endpoint.startswith(endpoints.UNIX)
         blocked = {"congestion_control": {"block": {"wait_before_close": (most if far else lease) * 1000}}}
-        link: dict[str, Any] = {"tx": {"lease": lease, "queue": blocked}}
+        link: dict[str, Any] = {"tx": {"lease": lease, "queue": blocked}, "rx": {"max_message_size": self.largest}}
         handshakes = {"open_timeout": most, "accept_timeout": most, "accept_pending": PENDING}
         transport: dict[str, Any] = {"shared_memory": quiet, "unicast": handshakes, "link": link}
         if self.tls is not None:

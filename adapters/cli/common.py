@@ -124,8 +124,10 @@ def wire_of(chosen: argparse.Namespace, endpoint: str, system: str) -> Wire:
 
     tls, token = (None if path is None else Path(path) for path in (chosen.tls, chosen.token))
     # `mapek up`, whose processes meet on this machine, takes no other patience.
-    patience = {"patience": chosen.patience} if hasattr(chosen, "patience") else {}
-    return Wire(endpoint, system, tls, chosen.insecure, token=token, **patience)
+    more: dict[str, Any] = {"patience": chosen.patience} if hasattr(chosen, "patience") else {}
+    if hasattr(chosen, "largest_message"):
+        more["largest"] = chosen.largest_message << 20
+    return Wire(endpoint, system, tls, chosen.insecure, token=token, **more)
 
 
 @contextlib.contextmanager

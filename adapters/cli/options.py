@@ -352,6 +352,21 @@ def _keeps(command: argparse.ArgumentParser) -> None:
         help="size of log.sqlite-wal at which a reader who stays in the middle of a transaction ends the run "
         "(default 256)",
     )  # fmt: skip
+    command.add_argument(
+        "--requests",
+        type=_positive,
+        default=100,
+        metavar="N",
+        help="questions of a kind and role a second that are answered at once; others wait, so that they do not slow "
+        "the run (default 100)",
+    )
+    command.add_argument(
+        "--largest-message",
+        type=_positive,
+        default=128,
+        metavar="MB",
+        help="take no larger message, in MiB; a Q-table with its state is one (default 128)",
+    )
 
 
 def _secure(command: argparse.ArgumentParser) -> None:

@@ -70,6 +70,7 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
         "durability": chosen.durability,
         "snapshot_every": chosen.snapshot_every,
         "wal_limit": chosen.wal_limit,
+        "requests": chosen.requests,
     }
     if chosen.log is not None:  # somebody else makes the tables
         path = None if chosen.log == ":memory:" else Path(chosen.log)  # in memory: to be measured against

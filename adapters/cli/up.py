@@ -137,9 +137,11 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
         *(["--tls", str(wire.tls)] if wire.tls else []),
         *(["--token", str(wire.token)] if wire.token else []),
         *(["--insecure"] if wire.insecure else []),
+        *["--largest-message", str(chosen.largest_message)],
     ]
     kept = ["--durability", chosen.durability, "--snapshot-every", str(chosen.snapshot_every)]
     kept += ["--wal-limit", str(chosen.wal_limit)]
+    kept += ["--requests", str(chosen.requests)]
     commands = {
         KNOWLEDGE: command_of(
             KNOWLEDGE, path, "--listen", wire.endpoint, "--log", str(folder.path / LOG_NAME), *kept, *shared

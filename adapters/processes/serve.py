@@ -18,6 +18,7 @@ from typing import Any
 from adapters.buses.hub import KnowledgeHub
 from adapters.buses.member import Member
 from adapters.buses.messages import Layout
+from adapters.buses.pace import PACE
 from adapters.buses.wire import Wire, versions
 from adapters.processes.supervise import ENDS_WITHIN
 from adapters.scratch import remove_orphan
@@ -145,6 +146,7 @@ def serve_knowledge(
     durability: str = "normal",
     snapshot_every: int = 100,
     wal_limit: int = WAL_LIMIT,
+    requests: int = PACE,
 ) -> None:
     """Be Knowledge until the run is complete and the roles have left.
 
@@ -156,7 +158,7 @@ def serve_knowledge(
     quick_switches()
     ledger = open_ledger(config, path, durability, wal_limit)
     try:
-        hub = KnowledgeHub(ledger, wire, json.loads(config.to_json()), versions(), snapshot_every)
+        hub = KnowledgeHub(ledger, wire, json.loads(config.to_json()), versions(), snapshot_every, requests)
         with hub:
             logger.info("Knowledge listens on %s; its log is %s", wire.endpoint, path or "in memory")
             while not hub.ended.wait(0.2):

@@ -1,0 +1,87 @@
+"""How often Knowledge answers: so many questions of a kind and role a second, so that none of them slows the run."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from queue import SimpleQueue
+from typing import Any
+
+from adapters.roles import ROLES
+
+PACE = 100
+"""Questions of one kind and role that are answered in each second."""
+
+PER_LOOP = 20
+"""So many times as often, for each loop, is answered what passes rest on: records, states, Q-tables, events."""
+
+WAITS = 5.0
+"""Seconds for which a question waits for its turn, at most; one that would wait for longer is not answered."""
+
+_BESIDE = ("status", "swap", "join")  # no pass rests on these
+
+
+class Pace:
+    """Lets questions through at their pace; those beyond it come late, and in order.
+
+    Parameters
+    ----------
+    take
+        Told each question in its turn.
+    leave
+        Told each that would have to wait for too long; who asked it asks again.
+    most
+        Questions of a kind and role a second.
+    loops
+        Number of loops of the run.
+    """
+
+    def __init__(
+        self, take: Callable[[Any], object], leave: Callable[[Any], object], most: int = PACE, loops: int = 1
+    ) -> None:
+        self._take, self._leave = take, leave
+        self._most, self._loops = most, loops
+        self._turn: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+        self._late: SimpleQueue[tuple[float, Any] | None] = SimpleQueue()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._hand_on, name="pace", daemon=True)
+
+    def start(self) -> None:
+        """Begin to let late questions through."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Let go what still waits."""
+        self._stopped.set()
+        self._late.put(None)
+        self._thread.join()
+
+    def hear(self, query: Any) -> None:
+        """Take a question under ``knowledge``; called on Zenoh's threads, which it does not hold up."""
+        what, _, role = str(query.key_expr).partition("/knowledge/")[2].partition("/")
+        most = self._most if what in _BESIDE else self._most * PER_LOOP * self._loops
+        kind = (what[:16], role if role in ROLES else "")
+        now = time.monotonic()
+        with self._lock:
+            turn = max(self._turn.get(kind, 0.0), now - 1.0) + 1.0 / most
+            waits = turn - now
+            if waits <= WAITS:
+                self._turn[kind] = turn
+                if len(self._turn) > 256:  # of kinds that there are not
+                    self._turn.clear()
+        if waits <= 0.0:
+            self._take(query)
+        elif waits <= WAITS:
+            self._late.put((turn, query))
+        else:
+            self._leave(query)
+
+    def _hand_on(self) -> None:
+        while (late := self._late.get()) is not None:
+            turn, query = late
+            if self._stopped.wait(max(0.0, turn - time.monotonic())):
+                self._leave(query)
+            else:
+                self._take(query)
