@@ -6,6 +6,7 @@ import logging
 import os
 import secrets
 import threading
+import time
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
@@ -21,6 +22,7 @@ from adapters.buses.messages import (
     Control,
     Table,
 )
+from adapters.buses.own_keys import OwnKeys
 from adapters.buses.pace import PACE, Pace
 from adapters.buses.presence import Presence
 from adapters.buses.wire import (
@@ -28,6 +30,7 @@ from adapters.buses.wire import (
     Wire,
     hand_over,
 )
+from adapters.roles import KNOWLEDGE
 from adapters.stores.ledger import Ledger
 from knowledge import MalformedRecord, QTable
 from mape.errors import BusError, MapekError, ResultsError
@@ -40,6 +43,9 @@ AT_ONCE = 1024
 
 SWAPPED_WITHIN = 60.0
 """Seconds that a role has to check a part that is asked for, and to reach the end of its pass."""
+
+FREE_WITHIN = 10.0
+"""Seconds that an endpoint has to be free again after its listener was closed, to be listened on with new keys."""
 
 
 class KnowledgeHub:
@@ -106,6 +112,8 @@ class KnowledgeHub:
         self._fetching: set[tuple[int, int]] = set()  # loop and pass of the Q-tables that Execute is asked for
         self._leave: Callable[..., object] | None = None
         self._worker: threading.Thread | None = None
+        self._keys: OwnKeys | None = None
+        self._declared = ExitStack()
         self._session: zenoh.Session | None = None
 
     def connect(self) -> None:
@@ -120,13 +128,20 @@ class KnowledgeHub:
         """
         if self._worker is not None:
             return
+        self._listen()
+        # Daemonic, so that a hub that was never closed does not keep its process from ending.
+        self._worker = threading.Thread(target=self._work, name="knowledge", daemon=True)
+        self._worker.start()
+        if self.wire.tls is not None:
+            self._keys = OwnKeys(self.wire.tls, KNOWLEDGE)
+        # At the latest at the interpreter's exit: a Zenoh thread that then still calls Python aborts the process.
+        self._leave = weakref.finalize(self, self._close)
+
+    def _listen(self) -> None:
+        session = self.wire.listen()
         with ExitStack() as opened:
-            self._session = session = self.wire.listen()
             opened.callback(session.close)
-            # Daemonic, so that a hub that was never closed does not keep its process from ending.
-            self._worker = worker = threading.Thread(target=self._work, name="knowledge", daemon=True)
-            worker.start()
-            opened.callback(self._finish, worker)
+            declared = opened.enter_context(ExitStack())
             pace = Pace(
                 lambda query: self._asked.put(("knowledge", query)),
                 lambda query: _leave_unanswered(("knowledge", query)),
@@ -134,29 +149,60 @@ class KnowledgeHub:
                 self.ledger.units,
             )
             pace.start()
-            opened.callback(pace.stop)
+            declared.callback(pace.stop)
             asked = zenoh.handlers.Callback(pace.hear, indirect=False)
             for key, handler in (
                 (self.wire.append("*"), hand_over(self._asked, "append")),
                 (self.wire.ask("**"), asked),
             ):
                 queryable = session.declare_queryable(key, handler, complete=True)
-                opened.callback(queryable.undeclare)
+                declared.callback(queryable.undeclare)
             beats = session.declare_subscriber(self.wire.beat("*"), hand_over(self._asked, "beat"))
-            opened.callback(beats.undeclare)
+            declared.callback(beats.undeclare)
             alive = self.wire.alive("*")
             tokens = session.liveliness().declare_subscriber(alive, hand_over(self._asked, "alive"), history=True)
-            opened.callback(tokens.undeclare)
+            declared.callback(tokens.undeclare)
             # Last: who sees the token finds everything else in place.
             token = session.liveliness().declare_token(self.wire.alive("knowledge", os.getpid()))
-            opened.callback(token.undeclare)
-            # At the latest at the interpreter's exit: a Zenoh thread that then still calls Python aborts the process.
-            self._leave = weakref.finalize(self, opened.pop_all().close)
+            declared.callback(token.undeclare)
+            opened.pop_all()
+        self._session, self._declared = session, declared
+
+    def look_at_keys(self) -> None:
+        """Warn of a certificate near its end; with one that was renewed, listen anew, while the run goes on.
+
+        Raises
+        ------
+        BusError
+            The endpoint cannot be listened on any more.
+        """
+        if self._keys is None or not self._keys.renewed():
+            return
+        self._declared.close()
+        assert self._session is not None
+        self._session.close()  # type: ignore[no-untyped-call]
+        self._asked.put(("renewed", None))  # whose tokens come again is here; of the others nobody told
+        deadline, tick = time.monotonic() + FREE_WITHIN, threading.Event()
+        while True:
+            try:
+                self._listen()
+                return
+            except BusError:
+                if time.monotonic() > deadline:
+                    raise
+                tick.wait(0.1)  # no event tells that the port is free
 
     def close(self) -> None:
         """Answer what was asked, then leave; the log stays."""
         if self._leave is not None:
             self._leave()
+
+    def _close(self) -> None:
+        self._declared.close()
+        if self._worker is not None:
+            self._finish(self._worker)
+        assert self._session is not None
+        self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
         self.connect()
@@ -235,6 +281,8 @@ class KnowledgeHub:
                 self.presence.beats(what)
             elif kind == "alive":
                 self.presence.token(what)
+            elif kind == "renewed":
+                self.presence.forget_tokens()
             elif kind == "table":
                 query, number, loop, table = what
                 self.ledger.store.keep_version(loop, number, table)

@@ -24,12 +24,13 @@ from adapters.buses.inbox import Inbox
 from adapters.buses.keeping import Keeping
 from adapters.buses.messages import Beat, Control, Dropped, Join, Joined, Layout, State
 from adapters.buses.outbox import Outbox
+from adapters.buses.own_keys import OwnKeys
 from adapters.buses.questions import Questions, Refused
 from adapters.buses.round_trip import RoundTrip
 from adapters.buses.wire import INPUT, LARGEST_MESSAGE, MISSING, ORDERED, Unanswered, Wire, hand_over, host, role_of
 from adapters.roles import KNOWLEDGE, STAGE_OF
 from knowledge import MalformedRecord, QTable, Record, to_json
-from mape.errors import BusError
+from mape.errors import BusError, ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +42,9 @@ DEAF_AFTER = 4.0
 
 FIRST_TRY = 0.5
 """Seconds that the first try to open a session takes at most; each further one over a slow network twice as long."""
+
+LOOK_AT_KEYS_EVERY = 1.0
+"""Seconds between two looks at the files of one's own keys."""
 
 BEAT_EVERY = 0.5
 """Seconds between two heartbeats."""
@@ -102,7 +106,9 @@ class Member(Questions):
         self._inbox = Inbox(wire, role, hand_over(self._arrived, "since"), self._waiting.append, self._round_trip)
         self._outbox = Outbox(wire, role, hand_over(self._arrived, "ack"), self._round_trip)
         self._keeping = Keeping(wire, role, self._arrived, self._round_trip)
-        self._kept_up_at = self._beat_at = 0.0
+        self._kept_up_at = self._beat_at = self._keys_looked_at = 0.0
+        self._keys: OwnKeys | None = None
+        self._renewed = False
         self._leave: Callable[..., object] | None = None
 
     # Coming and going.
@@ -116,7 +122,10 @@ class Member(Questions):
             Nobody was there within the patience; or Knowledge refuses this role, and says why.
         """
         deadline = None if self.patience is None else time.monotonic() + self.patience
-        self._attach(self._open(deadline), lambda: self._join(deadline))
+        session = self._open(deadline)
+        if self.wire.tls is not None:
+            self._keys = OwnKeys(self.wire.tls, self.role)
+        self._attach(session, lambda: self._join(deadline))
 
     def _attach(self, session: zenoh.Session, join: Callable[[], object]) -> None:
         with ExitStack() as opened:
@@ -210,14 +219,29 @@ class Member(Questions):
         self._deaf_since = None
         if not session.info.routers_zid():
             return  # Zenoh itself connects again
+        logger.warning("%s hears nothing from Knowledge, and opens another session", self.role)
+        self._open_another()
+
+    def _look_at_keys(self, now: float) -> None:
+        """Warn of a certificate near its end; with one that was renewed, open another session."""
+        if self._keys is None or now < self._keys_looked_at + LOOK_AT_KEYS_EVERY:
+            return
+        self._keys_looked_at = now
+        if self._keys.renewed() or self._renewed:
+            self._renewed = not self._open_another()
+
+    def _open_another(self) -> bool:
+        """Open another session in place of the one that is there; return whether that was possible."""
+        leave = self._leave
         try:
             another = self.wire.join(self.role, self._round_trip.within(FIRST_TRY))
-        except BusError:
-            return
-        logger.warning("%s hears nothing from Knowledge, and opens another session", self.role)
+        except (BusError, ConfigError):
+            return False
+        assert leave is not None
         leave()
         self._attach(another, lambda: None)
         self._link_again()
+        return True
 
     def _link_again(self) -> None:
         """Send and ask again what was under way over a link that is gone."""
@@ -418,6 +442,7 @@ class Member(Questions):
     def _keep_up(self, now: float) -> None:
         """Send again what was not acknowledged, and ask for what may have been missed."""
         self._kept_up_at = now + KEEP_UP_EVERY
+        self._look_at_keys(now)
         if self._outbox.keep_up(now):
             self._lost()
         self._inbox.keep_up(now)

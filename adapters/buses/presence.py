@@ -91,6 +91,11 @@ class Presence:
         else:
             self._seen[role].tokens.discard(int(epoch))
 
+    def forget_tokens(self) -> None:
+        """Know of nobody that it is here; who is comes again."""
+        for seen in self._seen.values():
+            seen.tokens.clear()
+
     def status(self) -> Status:
         """Say who is there, and how far the run is."""
         ledger = self._ledger

@@ -65,6 +65,10 @@ class Questions(ABC):
         """Take note that a question was lost."""
 
     @abstractmethod
+    def _look_at_keys(self, now: float) -> None:
+        """Take note of a certificate that ends, or was renewed."""
+
+    @abstractmethod
     def _between(self) -> None:
         """Do, between two pieces of something large, what is not to wait for all of it."""
 
@@ -125,6 +129,7 @@ class Questions(ABC):
                     f"Knowledge on {self.wire.endpoint} did not answer {self.role} ({outcome}). Is it running, with "
                     "the same system?"
                 )
+            self._look_at_keys(time.monotonic())
             if pause > 0.1:
                 self._say(f"waiting for Knowledge on {self.wire.endpoint}")
             # No event tells that a queryable is there again; where one reply was lost, the first pause is short.

@@ -206,7 +206,25 @@ def _check_readable(path: Path) -> None:
         raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
-def _check_certificates(authority: Path, certificate: Path, key: Path, role: str) -> None:
+def dates(folder: Path, role: str) -> list[tuple[Path, float, float]]:
+    """Return when the certificates begin and end by which a role proves who it is: file, and seconds since the epoch.
+
+    Raises
+    ------
+    ConfigError
+        As `tls`.
+    """
+    tls(folder, role)
+    folder = folder.absolute()
+    found = _check_certificates(authority_of(folder), folder / f"{role}.pem", folder / f"{role}.key", role)
+    seconds = ssl.cert_time_to_seconds
+    return [(path, float(seconds(one["notBefore"])), float(seconds(one["notAfter"]))) for path, one in found]
+
+
+def _check_certificates(
+    authority: Path, certificate: Path, key: Path, role: str
+) -> list[tuple[Path, Mapping[str, Any]]]:
+    """Look at a certificate and those of its authority, and return them, each with its file."""
     anew = "Make all keys anew: `mapek keys DIR`, in a new folder."
     renew = f"Renew it where {AUTHORITY}.key is: `mapek keys {certificate.parent} --renew {role}`."
     server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -245,6 +263,7 @@ def _check_certificates(authority: Path, certificate: Path, key: Path, role: str
             f"{certificate} is the certificate of {' and '.join(names) or 'nobody'}, not of {role}: its common name "
             f"has to be the role. {renew}"
         )
+    return [*((authority, root) for root in roots), (certificate, seen)]
 
 
 # The standard library does not read certificates, but it tells what the other end of a handshake has shown; with

@@ -161,8 +161,8 @@ def serve_knowledge(
         hub = KnowledgeHub(ledger, wire, json.loads(config.to_json()), versions(), snapshot_every, requests)
         with hub:
             logger.info("Knowledge listens on %s; its log is %s", wire.endpoint, path or "in memory")
-            while not hub.ended.wait(0.2):
-                pass  # in steps, so that signals are heard
+            while not hub.ended.wait(0.2):  # in steps, so that signals are heard
+                hub.look_at_keys()
             if hub.failure is not None:
                 raise hub.failure
             hub.left.wait(LEFT_WITHIN)
