@@ -57,7 +57,9 @@ def obstacle(command: str) -> str | None:
 def exhausted(error: BaseException) -> str | None:
     """Say which limit an error comes of, and the way out; None where it comes of none."""
     link: BaseException | None = error
-    while link is not None:
+    seen: set[int] = set()
+    while link is not None and id(link) not in seen:  # code of the user's may raise an error from itself
+        seen.add(id(link))
         if (said := _exhausted(link)) is not None:
             return said
         link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
