@@ -7,12 +7,11 @@ import shutil
 from pathlib import Path
 from typing import NamedTuple
 
-from replay_logs import begin, small, write_log
+from replay_logs import small, write_log
 
 from adapters.cli.main import main
 from adapters.results import RunFolder
 from adapters.stores import Store
-from adapters.stores.mark import mark_path
 
 QUIETLY = ("--no-figures", "-q")
 CONFIG = small(episodes=12)
@@ -68,15 +67,3 @@ def copied(folder: Path, to: Path) -> Path:
     shutil.rmtree(to, ignore_errors=True)
     shutil.copytree(folder, to)
     return to
-
-
-def begun(folder: Path, records: int = 0) -> Path:
-    """Make a folder of `mapek up` whose log has only begun."""
-    RunFolder(folder, "up", {"small": CONFIG}, command=["up", "small.json"]).close()
-    with Store(folder / "log.sqlite") as store:
-        begin(store, CONFIG)
-        store.commit()
-    return folder
-
-
-__all__ = ["CONFIG", "QUIETLY", "Said", "begun", "copied", "hashes", "logged", "mapek", "mark_path"]
