@@ -60,7 +60,7 @@ class _Parser(argparse.ArgumentParser):
     def _unknown(self, what: str, word: str, legal: Iterable[str]) -> NoReturn:
         from mape.errors import UnknownName
 
-        self.error(str(UnknownName(what, word, legal, self._way_out)))
+        self.error(str(UnknownName(what, word, legal, self._way_out if what == "option" else "")))
 
 
 class _Top(_Parser):

@@ -124,7 +124,7 @@ CASES = [
     sets("a swap after the last episode", 2, 'swap=[{pass=999, part="plan", to="morphin"}]', "pass 999", "episodes"),
     sets("loops below one", 2, "loops=0", "loops", "0", "greater than or equal to 1"),
     sets("more loops than there may be", 2, "loops=4097", "loops", "4097", "less than or equal to 4096"),
-    sets("an unknown mode", 2, "execute.mode=fast", "'fast'", "lockstep, free"),
+    sets("an unknown mode", 2, "execute.mode=fast", "'fast'", "free, lockstep"),
     sets("free-running without a rate", 2, "execute.mode=free", "rate", "episodes per second"),
     sets("a rate in lockstep", 2, "execute.rate=3.0", "rate", "lockstep", "Leave rate out"),
     sets("free-running in one process", 2, 'execute={mode="free", rate=3.0}', "mapek up"),
@@ -317,7 +317,7 @@ CASES = [
         ("config.toml", "is a file; name a folder"),
         ("config.toml", "--out", "config.toml"),
     ),
-    other("an unknown command", 2, "'rum'", "'run', 'compare'", command="rum", arguments=()),
+    other("an unknown command", 2, "'rum'", "did you mean 'run'?", command="rum", arguments=()),
     other(
         "reproduce of an unknown experiment",
         2,
