@@ -92,7 +92,7 @@ def check_system(make: Callable[[], ManagedSystem], episodes: int = EPISODES) ->
 
     def soft() -> None:
         system = fresh()
-        for number in range(1, EPISODES + 1):
+        for number in range(1, episodes + 1):
             for moment in _play(system, number):
                 if any(legal and not worth for legal, worth in zip(moment.legal, moment.explorable, strict=True)):
                     raise Noted(
