@@ -22,7 +22,7 @@ from typing import IO, Any, NamedTuple, Self
 from adapters import private
 from adapters.held import held_by
 from adapters.stores.mark import Mark, MarkFile, boot_id, mark_path, read_mark
-from adapters.stores.sums import SIZE, row_sum, toggled
+from adapters.stores.sums import SIZE, row_sum, seal_sum, toggled
 from mape.errors import ResultsError
 
 WAL_LIMIT = 256
@@ -30,6 +30,9 @@ WAL_LIMIT = 256
 
 READER_LEAVES_WITHIN = 10.0
 """Seconds that such a reader has to leave."""
+
+LOOK_EVERY = 16
+"""Commits from one look at the size of the write-ahead log to the next."""
 
 FLUSH_EVERY = 1000
 """Commits from one look to the next whether all before them are flushed."""
@@ -91,7 +94,7 @@ class Database:
         self._opened = False  # whether the file has proved to be a log
         self._writing = False
         self._durability = durability
-        self._wal_limit = wal_limit * 1_000_000
+        self._wal, self._wal_limit = f"{path}-wal", wal_limit * 1_000_000
         self._run_id, self._commits, self._total = "", 0, 0
         try:
             if path is not None:
@@ -177,7 +180,7 @@ class Database:
         form = self.form
         known = f"PRAGMA application_id = {form.application}; PRAGMA user_version = {form.version};"
         run, total = secrets.token_hex(16), bytes(SIZE)
-        seal = f"INSERT INTO seal VALUES (1, '{run}', 0, x'{total.hex()}', x'{_seal_sum(run, 0, total).hex()}');"
+        seal = f"INSERT INTO seal VALUES (1, '{run}', 0, x'{total.hex()}', x'{seal_sum(run, 0, total).hex()}');"
         return f"BEGIN; {form.schema} {seal} {known} COMMIT;"
 
     def _made(self, path: Path) -> IO[bytes] | None:
@@ -241,7 +244,7 @@ class Database:
             return
         commits = self._commits + 1
         total = self._total.to_bytes(SIZE, "big")
-        found = _seal_sum(self._run_id, commits, total)
+        found = seal_sum(self._run_id, commits, total)
         self._run("UPDATE seal SET commits = ?, total = ?, sum = ?", commits, total, found)
         self._run("COMMIT")
         self._writing = False
@@ -249,11 +252,12 @@ class Database:
         if self._mark is None:
             return
         # After the commit and before anybody is told of it: killed between the two, the log is ahead of its mark.
-        flushed = commits if self._durability == "full" else self._mark.mark.flushed
-        self._write_mark(self._mark, self._mark.mark._replace(commits=commits, flushed=flushed))
+        run, _, flushed, boot = self._mark.mark
+        self._write_mark(self._mark, Mark(run, commits, commits if self._durability == "full" else flushed, boot))
         if commits % FLUSH_EVERY == 0:
             self._flushed()
-        self._bound_wal()
+        if commits % LOOK_EVERY == 0:
+            self._bound_wal()
 
     def _write_mark(self, file: MarkFile, mark: Mark) -> None:
         try:
@@ -270,9 +274,8 @@ class Database:
 
     def _bound_wal(self) -> None:
         assert self.path is not None
-        wal = self.path.with_name(self.path.name + "-wal")
         try:
-            size = os.stat(wal).st_size
+            size = os.stat(self._wal).st_size
         except OSError:
             return
         if size <= self._wal_limit:
@@ -281,9 +284,9 @@ class Database:
         blocked, _, _ = self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         if blocked:
             raise ResultsError(
-                f"{wal} has grown to {size / 1e6:,.0f} MB, beyond its limit of {self._wal_limit / 1e6:,.0f} MB: a "
-                f"reader who is in the middle of a transaction ({_holders(self.path)}) keeps it from being moved into "
-                f"{self.path.name}. What was acknowledged is kept; end the reader, or raise --wal-limit, and go on "
+                f"{self._wal} has grown to {size / 1e6:,.0f} MB, beyond its limit of {self._wal_limit / 1e6:,.0f} MB: "
+                f"a reader who is in the middle of a transaction ({_holders(self.path)}) keeps it from being moved "
+                f"into {self.path.name}. What was acknowledged is kept; end the reader, or raise --wal-limit, and go on "
                 "with `mapek resume`."
             )
 
@@ -409,7 +412,7 @@ class Database:
 
     def _read_seal(self) -> None:
         seal = self._first("SELECT run, commits, total, sum FROM seal WHERE one = 1")
-        if seal is None or seal[3] != _seal_sum(*seal[:3]):
+        if seal is None or list(map(type, seal[:3])) != [str, int, bytes] or seal[3] != seal_sum(*seal[:3]):
             raise self._unreadable("its table seal is not what was written there")
         self._run_id, self._commits, self._total = seal[0], seal[1], int.from_bytes(seal[2], "big")
 
@@ -480,10 +483,6 @@ _WAY_OUT = "What is damaged there only a copy of the whole folder from before me
 def _any_text(data: bytes) -> str:
     # What is damaged may be no text any more, and is to be named by its place all the same.
     return data.decode("utf-8", "surrogateescape")
-
-
-def _seal_sum(run: str, commits: int, total: bytes) -> bytes:
-    return row_sum("seal", (run, commits, total))
 
 
 def _holders(path: Path) -> str:

@@ -35,6 +35,11 @@ def record_sum(before: bytes, loop: int, number: int, stage: int, body: str, row
     return hashlib.sha256(b"%b%b%b%b" % (before, head.encode(), data, packed)).digest()
 
 
+def seal_sum(run: str, commits: int, total: bytes) -> bytes:
+    """Return the sum of the row that seals a file: the total, after so many commits of a run."""
+    return hashlib.sha256(b"%b %d %b" % (run.encode("utf-8", "surrogateescape"), commits, total)).digest()
+
+
 def toggled(total: int, row: bytes) -> int:
     """Return the total with a row's sum put in, or taken out."""
     return total ^ int.from_bytes(row, "big")

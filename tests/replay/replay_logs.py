@@ -12,7 +12,7 @@ from adapters.results.files import file_sum, read_sealed, write_sealed
 from adapters.stores import Store
 from adapters.stores.ledger import Ledger
 from adapters.stores.sqlite_store import COLUMNS, KEYS, Snapshot, Swap
-from adapters.stores.sums import SIZE, record_sum, row_sum, toggled
+from adapters.stores.sums import SIZE, record_sum, row_sum, seal_sum, toggled
 from adapters.systems import make_system
 from knowledge import STAGES, ChangePlan, Knowledge, Log, Record, to_json
 from mape.config import Config, from_table
@@ -173,7 +173,7 @@ def reseal(path: Path) -> None:
                 total = toggled(total, found)
         run, commits = db.execute("SELECT run, commits FROM seal").fetchone()
         sealed = total.to_bytes(SIZE, "big")
-        db.execute("UPDATE seal SET total = ?, sum = ?", (sealed, row_sum("seal", (run, commits, sealed))))
+        db.execute("UPDATE seal SET total = ?, sum = ?", (sealed, seal_sum(run, commits, sealed)))
     db.close()
 
 
