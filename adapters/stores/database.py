@@ -286,8 +286,8 @@ class Database:
             raise ResultsError(
                 f"{self._wal} has grown to {size / 1e6:,.0f} MB, beyond its limit of {self._wal_limit / 1e6:,.0f} MB: "
                 f"a reader who is in the middle of a transaction ({_holders(self.path)}) keeps it from being moved "
-                f"into {self.path.name}. What was acknowledged is kept; end the reader, or raise --wal-limit, and go on "
-                "with `mapek resume`."
+                f"into {self.path.name}. What was acknowledged is kept; end the reader, or raise --wal-limit, and go "
+                "on with `mapek resume`."
             )
 
     def roll_back(self) -> None:
