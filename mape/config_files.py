@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from pathlib import Path
 
@@ -12,6 +13,7 @@ SUFFIXES = (".toml", ".json")
 """Of files that are read as configs."""
 
 
+@functools.cache  # asked for each part of each trial
 def examples() -> Path:
     """Return the folder of the examples: within this package where it is installed, beside it in a checkout."""
     inside = Path(__file__).with_name("examples")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import json
@@ -160,6 +161,11 @@ def lacks(kind: str, part: Any) -> tuple[str, ...]:
     return tuple(name for name in METHODS.get(kind, ()) if not callable(inspect.getattr_static(part, name, None)))
 
 
+@functools.cache  # asked for each part of each trial
+def _lacks(kind: str, part: Any) -> tuple[str, ...]:
+    return lacks(kind, part)
+
+
 def _check_class(kind: str, name: str, part: Any) -> None:
     # Before anything of it is called: what a name leads to may be any class or function that can be imported.
     if not inspect.isclass(part):
@@ -167,7 +173,8 @@ def _check_class(kind: str, name: str, part: Any) -> None:
             f"{kind} {name!r} is a {type(part).__name__}, and a part is made of a class. Name the class of it, "
             '"module:Class"'
         )
-    if missing := lacks(kind, part):
+    made: Any = part  # mypy knows no hash of a class
+    if missing := _lacks(kind, made):
         unseen = [value for value in VALUES.get(kind, ()) if not hasattr(part, value)]
         raise ConfigError(_incomplete(kind, name, [*unseen, *missing]))
 
