@@ -254,7 +254,22 @@ class Config(PartConfig):
 
 
 def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
-    """Make a config of a plain table, with every part's options checked.
+    """Make a config of a plain table, with every part's options checked, for which its class is imported.
+
+    Raises
+    ------
+    ConfigError
+        Names each field that is wrong, its value, and what is legal.
+    """
+    config = from_foreign_table(table, where)
+    for kind, path, spec in parts_of(config):
+        registry.options_of(kind, spec, f"{where}: {path}")
+    refuse_infinity(table, f"{where}: ")  # of options that no model has looked at
+    return config
+
+
+def from_foreign_table(table: Mapping[str, Any], where: str = "the config") -> Config:
+    """Make a config of a plain table that somebody else may have written: nothing is imported, no option looked at.
 
     Raises
     ------
@@ -263,15 +278,11 @@ def from_table(table: Mapping[str, Any], where: str = "the config") -> Config:
     """
     try:
         # From JSON text, where a list may stand for a tuple even in strict mode.
-        config = Config.model_validate_json(json.dumps(table, default=lambda value: _refuse(value, where)))
+        return Config.model_validate_json(json.dumps(table, default=lambda value: _refuse(value, where)))
     except ValidationError as error:
         if "recursion limit" in error.errors()[0]["msg"]:  # pydantic's, which is below Python's
             raise ConfigError(f"{where} holds {TOO_DEEP}") from None
         raise ConfigError(explain(error, f"{where}: ", Config)) from None
-    for kind, path, spec in parts_of(config):
-        registry.options_of(kind, spec, f"{where}: {path}")
-    refuse_infinity(table, f"{where}: ")  # of options that no model has looked at
-    return config
 
 
 def parts_of(config: Config) -> Iterable[tuple[str, str, PartSpec]]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adapters.cli.main import OutputError
+from adapters.cli.trust import check_trust
 from adapters.experiments.runner import Checked, announce_compilation, check
 from adapters.experiments.statistics import finite
 from adapters.results import RunFolder
@@ -79,6 +80,8 @@ def open_folder(
     check_json_target(chosen)
     if chosen.out and os.path.exists(chosen.out) and not os.path.isdir(chosen.out):
         raise ConfigError(f"--out {chosen.out!r} is a file; name a folder, which may be new")
+    if chosen.out and os.path.isdir(chosen.out):
+        check_trust(chosen, Path(chosen.out))
     caution(configs.values())
     for agent, config in configs.items():
         check_name(agent)

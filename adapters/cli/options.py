@@ -326,10 +326,19 @@ def _what_runs(command: argparse.ArgumentParser) -> None:
 def _how(command: argparse.ArgumentParser) -> None:
     command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one per core)")
     command.add_argument("-q", "--quiet", action="store_true", help="no progress bar")
+    _trusting(command)
+
+
+def _trusting(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--trust", action="store_true",
+        help="run what the folder names, although somebody else may have written it; else it is asked for",
+    )  # fmt: skip
 
 
 def _where_to(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", metavar="DIR", help="new folder, or that of an unfinished run to be continued")
+    _trusting(command)
     command.add_argument("--json", metavar="FILE", help="write the result as JSON too; - for standard output")
     command.add_argument("--no-figures", action="store_true", help="leave the figures out")
     command.add_argument("-q", "--quiet", action="store_true", help="no progress bar")

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from adapters.cli.common import prepare
 from adapters.cli.sentences import ids, sentence
+from adapters.cli.trust import check_trust
 from adapters.replay.records import Difference, LogReplay, Moment, Replayed, as_json, log_of
 from adapters.replay.tables import replay_tables
 from adapters.results.files import read_sealed
@@ -29,6 +30,7 @@ def execute(chosen: argparse.Namespace) -> int:
     prepare()
     folder = Path(chosen.folder)
     path = log_of(folder)
+    check_trust(chosen, folder)
     if path is None:
         return _tables(chosen, folder)
     with Store(path, readonly=True) as store:

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 from adapters import private
 from adapters.cli.main import dispatch
 from adapters.cli.options import parser
+from adapters.cli.trust import check_trust
 from adapters.results.folder import read_manifest
 from adapters.scratch import scratch
 from mape.config_files import find_config
@@ -21,7 +23,7 @@ from mape.errors import ConfigError, ResultsError
 
 def execute(chosen: argparse.Namespace) -> int:
     """Run the command."""
-    folder = Path(chosen.folder).resolve()
+    folder = Path(chosen.folder).resolve()  # of a link somebody else may make another one meanwhile
     private.refuse_links(folder)
     manifest = read_manifest(folder)
     if (folder / "result.json").exists():
@@ -32,7 +34,9 @@ def execute(chosen: argparse.Namespace) -> int:
             f"{folder} does not say which command began it; give that command again, with --out {folder}, to continue"
         )
     again = _parsed(command, folder)
-    again.out = str(folder)
+    # A config that the command names may be another one than the manifest holds: it is part of what is trusted.
+    check_trust(chosen, folder, [f"{shlex.join(['mapek', *command])}, in {cwd}, with all that its configs there name"])
+    again.out, again.trust = str(folder), True
     again.quiet = again.quiet or chosen.quiet
     again.mended = chosen.mended
     # What stands in a folder may be somebody else's word, and is not to say which file of this machine is replaced.

@@ -19,7 +19,7 @@ from adapters.stores.mark import mark_path
 from adapters.systems import make_system
 from adapters.systems.declared import is_plant
 from knowledge import STAGES, Ack, ChangePlan, FreeLog, Observation, Record, RowLayout, from_json, to_json
-from mape.config import Config, from_table
+from mape.config import Config, from_foreign_table
 from mape.errors import ConfigError, PartError, ResultsError
 from mape.near import did_you_mean, nearest_path
 from mape.parts import config_at
@@ -125,7 +125,7 @@ class LogReplay:
         facts = store.facts()
         if "config" not in facts or "layout" not in facts:
             raise ResultsError(f"{store.path} holds no record yet")
-        self.config: Config = from_table(facts["config"], f"the config in {store.path}")
+        self.config: Config = from_foreign_table(facts["config"], f"the config in {store.path}")
         self.versions: dict[str, str] = facts.get("versions", {})
         self.layout: RowLayout = layout_from(facts["layout"])
         self.free = self.config.execute.mode == "free"

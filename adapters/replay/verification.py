@@ -14,7 +14,7 @@ from adapters.results.files import changed, file_sum, read_json, read_sealed
 from adapters.results.folder import LOGS_OF_AGENTS, is_summed, read_manifest
 from adapters.stores import LOG_NAME, Store
 from adapters.stores.mark import mark_path
-from mape.config import from_table
+from mape.config import from_foreign_table
 from mape.errors import ResultsError
 
 ROWS = {
@@ -108,7 +108,7 @@ def _hashes(log: LogReplay, stored: Mapping[str, Any]) -> None:
 
 def _chunks(folder: Path, manifest: Mapping[str, Any], held: set[str]) -> Iterator[tuple[str, str]]:
     for agent, table in manifest["agents"].items():
-        config = from_table(table, f"{folder / 'manifest.json'}, {agent}")
+        config = from_foreign_table(table, f"{folder / 'manifest.json'}, {agent}")
         for path in sorted((folder / "chunks" / agent).glob("*.json")):
             stem = path.with_suffix("")
             trials = read_chunk(stem, config) or ()
