@@ -43,6 +43,9 @@ DEAF_AFTER = 4.0
 FIRST_TRY = 0.5
 """Seconds that the first try to open a session takes at most; each further one over a slow network twice as long."""
 
+TRY_EVERY = 0.05
+"""Seconds from one try to the next, which may have ended at once, as where there is no token yet."""
+
 LOOK_AT_KEYS_EVERY = 1.0
 """Seconds between two looks at the files of one's own keys."""
 
@@ -177,6 +180,7 @@ class Member(Questions):
                     patience.in_vain()
                 why = f" ({error})" if error.found else ""
                 self._say(f"waiting for Knowledge on {self.wire.endpoint}{why}")
+                threading.Event().wait(TRY_EVERY)
 
     def _join(self, deadline: float | None) -> None:
         challenge = secrets.token_hex(16)

@@ -121,7 +121,7 @@ def of_few(trials: int) -> str | None:
     if not 1 < trials < FEW:
         return None
     return (
-        f"{trials} trials are few: intervals of fewer than {FEW} come out too narrow, and tests rest on a normal "
+        f"{trials} trials are few: intervals of fewer than {FEW} come out too narrow, and tests rest on a normal\n"
         "distribution that nobody has seen. Give more --trials before anything is claimed."
     )
 

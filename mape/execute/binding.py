@@ -109,10 +109,18 @@ def by_calls(learner: Learner) -> Driver:
         "act": drive.act_by_calls,
         "credit": drive.credit_by_calls,
         "explorable": drive.explorable_by_calls,
-        "value": _told_apart(learner, "value"),
-        "step_size": _told_apart(learner, "step_size"),
     }
-    plain = Composed(episode.episode, bound).python()
+    return _plain(bound, learner)
+
+
+def by_rules_in_python(rules: StepRules, learner: Learner) -> Driver:
+    """Return the episode of `by_rules` as plain Python, in which whose rule raised can be told."""
+    return _plain(composed(rules, learner).bindings, learner)
+
+
+def _plain(bound: Bindings, learner: Learner) -> Driver:
+    told_apart = {name: _told_apart(learner, name) for name in ("value", "step_size")}
+    plain = Composed(episode.episode, {**bound, **told_apart}).python()
 
     def quiet(*arguments: Any) -> Any:
         # What overflows is refused by the episode itself, with the number in the message.

@@ -253,7 +253,8 @@ class Execute:
         trace = np.empty((self.system.max_steps, len(episode.TRACE_COLUMNS))) if tracing else self._no_trace
         try:
             status, steps, total, td_error, change = self._driven(number, plan.epsilon, at, trace)
-        except BaseException as error:
+        except BaseException as caught:
+            error = self._in_python(caught, number, plan.epsilon, at)
             self._workspace.roll_back()
             contract = isinstance(error, (ManagedSystemError, PartError))
             if not contract and isinstance(error, (MapekError, *STOPS)):
@@ -319,6 +320,18 @@ class Execute:
             self._workspace.forget()
         uniforms.settle(found[1])
         return found
+
+    def _in_python(self, error: BaseException, *arguments: Any) -> BaseException:
+        """Return what an episode that raised where it was compiled raises in Python, which tells whose rule it was."""
+        if self.rules is None or isinstance(error, (MapekError, *STOPS)):
+            return error
+        self._workspace.roll_back()
+        self._workspace.forget()
+        try:
+            binding.by_rules_in_python(self.rules, self.learner)(*arguments, self._no_trace, *self._fixed)
+        except faults() as told_apart:
+            return told_apart
+        return error
 
     def quiet_until(self, last: int) -> int:
         """Return the pass, `last` at most, up to which all episodes are alike.

@@ -181,7 +181,7 @@ def test_a_planner_takes_up_where_its_state_was_given(name):
         ({"alpha": 0.5, "alpha_max": 0.4}, "alpha_max = 0.4 is below alpha = 0.5"),
         ({"enable_on_drift": [3, 3]}, "must be distinct action ids"),
         ({"enable_on_drift": [-1]}, "must be distinct action ids"),
-        ({"respond_to": ["drit"]}, "'drift', 'added' or 'removed'"),
+        ({"respond_to": ["drit"]}, "drift, added, removed"),
         ({"alpha": 0.0}, "greater than 0"),
         ({"k": 701.0}, "less than or equal to 700"),
     ],

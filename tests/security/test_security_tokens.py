@@ -53,6 +53,14 @@ def make(endpoint, given=None):
 # What it is, and where.
 
 
+def test_a_role_that_waits_for_it_looks_again_now_and_then(runtime, endpoint, monkeypatch):
+    looks = []
+    monkeypatch.setattr(tokens, "find", lambda *given, find=tokens.find: looks.append(1) or find(*given))
+    with pytest.raises(Unanswered, match="there is no token"):
+        Member(Wire(endpoint, "example"), "plan", patience=1.0).connect()
+    assert 1 < len(looks) < 50  # on a slow machine fewer; without a pause it was thousands
+
+
 def test_it_is_made_once_for_its_owner_alone_with_a_secret_of_its_own_for_each_role(runtime, endpoint):
     path = make(endpoint)
     assert path.parent == runtime / "mapek"
