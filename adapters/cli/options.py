@@ -370,6 +370,10 @@ def _keeps(command: argparse.ArgumentParser) -> None:
         "the run (default 100)",
     )
     command.add_argument(
+        "--refusals", type=_positive, default=60, metavar="N",
+        help="lines a minute that are written of who is turned away; of the others the count (default 60)",
+    )  # fmt: skip
+    command.add_argument(
         "--largest-message",
         type=_positive,
         default=128,

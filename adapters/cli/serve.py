@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -13,6 +14,7 @@ from adapters.buses.endpoints import folder_of
 from adapters.buses.wire import Wire, system_segment
 from adapters.cli.common import config_of, open_folder, prepare, wire_of
 from adapters.cli.terminal import Clean
+from adapters.processes import sieve
 from adapters.processes.serve import (
     Terminated,
     leash,
@@ -61,8 +63,7 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
             f"for so long; {chosen.role} has no system"
         )
     wire = wire_of(chosen, endpoint, system_segment(config.system.id))
-    if wire.tls is not None:
-        _keep_standard_output()
+    _keep_standard_output(chosen.refusals if knowledge else None)
     if not knowledge:
         serve_role(config, chosen.role, wire, released, chosen.hang_after)
         return 0
@@ -80,11 +81,23 @@ def _serve(chosen: argparse.Namespace, released: threading.Event | None) -> int:
     return 0
 
 
-def _keep_standard_output() -> None:
-    """Lead what Zenoh writes of refusals to standard error; it knows standard output only, where results may go."""
+def _keep_standard_output(most: int | None) -> None:
+    """Lead what Zenoh writes to standard error; it knows standard output only, where results may go.
+
+    Of Knowledge's, which anybody may make it write, `most` lines a minute.
+    """
     sys.stdout.flush()
     ours = os.dup(1)
-    os.dup2(2, 1)
+    os.environ.setdefault("NO_COLOR", "1")
+    if most is None:
+        os.dup2(2, 1)
+    else:
+        # It ends when this process does, and in a session of its own no sooner.
+        program = [sys.executable, "-I", "-S", sieve.__file__, str(most)]
+        through = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=2, start_new_session=True)
+        assert through.stdin is not None
+        os.dup2(through.stdin.fileno(), 1)
+        through.stdin.close()
     sys.stdout = Clean(os.fdopen(ours, "w", encoding="utf-8"))
 
 

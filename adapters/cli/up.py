@@ -141,7 +141,7 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
     ]
     kept = ["--durability", chosen.durability, "--snapshot-every", str(chosen.snapshot_every)]
     kept += ["--wal-limit", str(chosen.wal_limit)]
-    kept += ["--requests", str(chosen.requests)]
+    kept += ["--requests", str(chosen.requests), "--refusals", str(chosen.refusals)]
     commands = {
         KNOWLEDGE: command_of(
             KNOWLEDGE, path, "--listen", wire.endpoint, "--log", str(folder.path / LOG_NAME), *kept, *shared
