@@ -23,7 +23,7 @@ from adapters.buses.messages import (
     Table,
 )
 from adapters.buses.own_keys import OwnKeys
-from adapters.buses.pace import PACE, Pace
+from adapters.buses.pace import PACE, ROOM, Pace, Room
 from adapters.buses.presence import Presence
 from adapters.buses.wire import (
     ORDERED,
@@ -109,6 +109,7 @@ class KnowledgeHub:
             proof=wire.proof,
             fetch_table=self._fetch_table,
         )
+        self._rooms = {kind: self._room(kind) for kind in ("append", "beat")}
         self._fetching: set[tuple[int, int]] = set()  # loop and pass of the Q-tables that Execute is asked for
         self._leave: Callable[..., object] | None = None
         self._worker: threading.Thread | None = None
@@ -150,14 +151,13 @@ class KnowledgeHub:
             )
             pace.start()
             declared.callback(pace.stop)
-            asked = zenoh.handlers.Callback(pace.hear, indirect=False)
             for key, handler in (
-                (self.wire.append("*"), hand_over(self._asked, "append")),
-                (self.wire.ask("**"), asked),
+                (self.wire.append("*"), _direct(self._rooms["append"].hear)),
+                (self.wire.ask("**"), _direct(pace.hear)),
             ):
                 queryable = session.declare_queryable(key, handler, complete=True)
                 declared.callback(queryable.undeclare)
-            beats = session.declare_subscriber(self.wire.beat("*"), hand_over(self._asked, "beat"))
+            beats = session.declare_subscriber(self.wire.beat("*"), _direct(self._rooms["beat"].hear))
             declared.callback(beats.undeclare)
             alive = self.wire.alive("*")
             tokens = session.liveliness().declare_subscriber(alive, hand_over(self._asked, "alive"), history=True)
@@ -275,7 +275,16 @@ class KnowledgeHub:
             _, _, rest = str(answer.query.key_expr).split("/", 2)
             answer.query.reply(f"mape/{self.wire.system}/{rest}", answer.payload)
 
+    def _room(self, kind: str) -> Room:
+        return Room(
+            lambda what: self._asked.put((kind, what)),
+            lambda what: _leave_unanswered((kind, what)),
+            ROOM * self.ledger.units,
+        )
+
     def _hear(self, kind: str, what: Any, answers: list[Answer | Relay]) -> None:
+        if kind in self._rooms:
+            self._rooms[kind].heard(what)
         try:
             if kind == "beat":
                 self.presence.beats(what)
@@ -380,6 +389,10 @@ class KnowledgeHub:
                     return bytes(reply.ok.payload.to_bytes())
                 said = reply.err.payload.to_string() if reply.err is not None else said
         raise BusError(said)
+
+
+def _direct(hear: Callable[[Any], object]) -> zenoh.handlers.Callback[Any]:
+    return zenoh.handlers.Callback(hear, indirect=False)
 
 
 def _leave_unanswered(asked: tuple[str, Any] | None) -> None:

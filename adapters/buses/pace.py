@@ -19,6 +19,9 @@ PER_LOOP = 20
 WAITS = 5.0
 """Seconds for which a question waits for its turn, at most; one that would wait for longer is not answered."""
 
+ROOM = 1024
+"""Records of one role, for each loop, that wait to be appended at most; of signs of life as many."""
+
 _BESIDE = ("status", "swap", "join")  # no pass rests on these
 
 
@@ -85,3 +88,39 @@ class Pace:
                 self._leave(query)
             else:
                 self._take(query)
+
+
+class Room:
+    """Lets each role have so much waiting, so that none keeps the others waiting behind what it sends.
+
+    Parameters
+    ----------
+    take
+        Told each message that there is room for.
+    leave
+        Told each other; who sent it sends it again.
+    most
+        Messages of a role that wait at most, until `heard` is told of them.
+    """
+
+    def __init__(self, take: Callable[[Any], object], leave: Callable[[Any], object], most: int = ROOM) -> None:
+        self._take, self._leave, self._most = take, leave, most
+        self._waiting = dict.fromkeys((*ROLES, ""), 0)
+        self._lock = threading.Lock()
+
+    def hear(self, what: Any) -> None:
+        """Take a query or sample whose key ends with its role; called on Zenoh's threads."""
+        role = self._role(what)
+        with self._lock:
+            there_is = self._waiting[role] < self._most
+            self._waiting[role] += there_is
+        (self._take if there_is else self._leave)(what)
+
+    def heard(self, what: Any) -> None:
+        """Make room again: what was taken is dealt with."""
+        with self._lock:
+            self._waiting[self._role(what)] -= 1
+
+    def _role(self, what: Any) -> str:
+        role = str(what.key_expr).rpartition("/")[2]
+        return role if role in self._waiting else ""

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adapters.buses import Wire, pace
-from adapters.buses.pace import Pace
+from adapters.buses.pace import ROOM, Pace, Room
 from mape.errors import BusError
 
 
@@ -110,3 +110,44 @@ def test_a_flood_of_status_is_answered_late_and_the_records_are_not(small):
         stop.set()
         flooding.join(60)
     assert small.ledger.last(0) == (3, 3, 3, 3)
+
+
+@given(st.integers(1, 50), st.lists(st.sampled_from(["plan", "monitor", "made-up", "heard"]), max_size=300))
+def test_of_each_role_so_much_waits_whatever_the_others_send(most, sent):
+    taken, left = [], []
+    room = Room(taken.append, left.append, most)
+    waiting = []
+    for what in sent:
+        if what != "heard":
+            message = SimpleNamespace(key_expr=f"mape/s/0/append/{what}", role=what)
+            fits = sum(other.role == what for other in waiting) < most
+            room.hear(message)
+            assert (taken if fits else left)[-1] is message
+            waiting += [message] * fits
+        elif waiting:
+            room.heard(waiting.pop(0))
+
+
+def test_a_flood_of_records_of_one_role_fills_no_memory_and_holds_up_no_other(small, monkeypatch):
+    small.everybody()
+    small.send(*run_of(3))
+    append, busy, go_on, heard = small.hub.answers.append, threading.Event(), threading.Event(), []
+
+    def slowly(query):
+        if "append/plan" in str(query.key_expr):
+            heard.append(query)
+            busy.set()
+            assert go_on.wait(60)
+        return append(query)
+
+    monkeypatch.setattr(small.hub.answers, "append", slowly)
+    flood, left = 2 * ROOM, []
+    with small.wire.join("plan", 60) as evil:
+        for number in range(flood):
+            replies = evil.get("mape/s/0/append/plan", payload=b"{}", attachment=b"1", timeout=60)
+            if number >= ROOM + 1 and busy.wait(60):
+                left += list(replies)  # comes at once, for this one was left
+        assert left == []
+        go_on.set()
+        small.members["monitor"].ask("status")
+    assert len(heard) <= ROOM + 1
