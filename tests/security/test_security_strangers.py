@@ -30,6 +30,7 @@ from adapters.systems import make_system
 from mape import load
 
 endpoint, mark, config, home = sys.argv[1:]
+serve._keep_standard_output = lambda most: None  # it starts the interpreter once more
 os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp()
 tokens.make("tcp/127.0.0.1:9", security.CLIENTS)
 main.main(["status", "--connect", "tcp/127.0.0.1:9"])
