@@ -281,6 +281,12 @@ def test_a_key_that_means_everything_is_refused_by_all_that_hear_it(site, raw, j
             "loop 5; this run has loops",
         ),
         ("event/plan", Happened(kind="begun", text="", loop=0, pass_no=1).pack(), b"1", "only Execute begins episodes"),
+        (
+            "event/plan",
+            Happened(kind="aborted", text="", loop=0, pass_no=1).pack(),
+            b"1",
+            "only Execute begins episodes",
+        ),
     ],
 )
 def test_what_is_brought_out_of_place_is_refused_and_changes_nothing(

@@ -242,7 +242,7 @@ def test_an_unfinished_log_is_told_as_far_as_it_goes(mapek: Mapek, log: Path) ->
     [
         (("--pass", "1:13"), 2, "--pass 1:13 goes beyond the run's 12 episodes"),
         (("--loop", "1"), 2, "--loop 1: the run has loops 0 to 0"),
-        (("--stage", "plans"), 2, "invalid choice: 'plans'"),
+        (("--stage", "plans"), 2, "unknown --stage 'plans'"),
     ],
 )
 def test_what_the_log_cannot_have_is_refused(
