@@ -161,7 +161,7 @@ def block_of(values: Sequence[Floats]) -> int:
     """Return how many episodes share a mean, where curves of these shapes are drawn: as few as can be read.
 
     >>> [block_of([np.zeros(shape)]) for shape in ((200, 900), (30, 900), (1, 900), (200, 10_000), (1, 50))]
-    [1, 4, 22, 17, 1]
+    [2, 4, 22, 17, 1]
     """
     trials, length = min(len(v) for v in values), int(max(v.shape[1] for v in values))
     return max(-(-length // POINTS), min(-(-EPISODES // trials), length // FEW), 1)
@@ -183,7 +183,7 @@ def summarise(values: Floats, block: int, breaks: Sequence[int] | Ints = ()) -> 
     Examples
     --------
     >>> summarise(np.array([[0.0, 2.0, 4.0, 9.0]]), block=2, breaks=[4])
-    Curve(edges=array([1, 3, 4, 5]), mean=array([1., 4., 9.]), low=array([1., 4., 9.]), high=array([1., 4., 9.]))
+    Curve(edges=array([1, 2, 4, 5]), mean=array([0., 3., 9.]), low=array([0., 3., 9.]), high=array([0., 3., 9.]))
     """
     # Imported here: it takes longer than all the rest of this package, and only this needs it.
     from scipy.special import stdtrit

@@ -80,7 +80,7 @@ class Drawn:
     Examples
     --------
     >>> drawn, stream = Drawn(7, (0, 0), 30_000), Uniforms(7, (0, 0), 30_000)
-    >>> [drawn.values[drawn.find(3) + k] == stream.values[stream.find(3) + k] for k in (0, 29_999)]
+    >>> [bool(drawn.values[drawn.find(3) + k] == stream.values[stream.find(3) + k]) for k in (0, 29_999)]
     [True, True]
     """
 
