@@ -99,6 +99,9 @@ class Unreliable:
         for one in changed:
             self.session.put(key, one, **options)
 
+    def close(self):
+        self.session.close()
+
 
 @pytest.mark.parametrize("lost", [{0}, {1}, {0, 1}, {3, 4, 5}, {9}, set(range(10))])
 def test_a_publication_that_is_lost_is_fetched(site, all_four, lost):
