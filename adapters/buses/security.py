@@ -197,7 +197,8 @@ def _check_readable(path: Path) -> None:
     try:
         path.open("rb").close()
     except FileNotFoundError:
-        near = did_you_mean(nearest_path(path, os.path.isfile))
+        # Of another role's file in the same folder nobody thought.
+        near = did_you_mean(None if path.parent.is_dir() else nearest_path(path, os.path.isfile))
         raise ConfigError(
             f"there is no {path}{near} Make all keys with `mapek keys DIR`, in a new folder, and give each host "
             "ca.pem and the .pem and .key of its roles."

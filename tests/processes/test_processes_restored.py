@@ -186,7 +186,7 @@ def test_knowledge_on_a_complete_log_to_which_nobody_comes_leaves_after_a_while(
 
 @pytest.mark.parametrize(("redrivable", "noted"), [(False, [1]), (True, [])])
 def test_a_first_episode_that_was_broken_off_and_cannot_be_driven_again_is_noted(here, redrivable, noted):
-    config = paced(6, {"system": {"redrivable": redrivable}})
+    config = paced(6, {"system": {"redrivable": redrivable, "retries": 1}})
     with Roles(config, here) as run:
         run.start("execute")
         run.until(lambda: run.roles["execute"].units, "an Execute")
