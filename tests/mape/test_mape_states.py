@@ -167,11 +167,19 @@ def test_a_run_with_swaps_is_taken_up_with_the_parts_that_serve_it_then(after):
 
 
 def test_an_execute_takes_up_a_state_from_before_the_first_episode():
-    plain, used = corridor_loop(), corridor_loop()
+    plain, used = loop_of(config(TRAFFIC)), loop_of(config(TRAFFIC))
     used.execute.restore(*plain.execute.state())
     plain.run(5)
     used.run(5)
     assert hashes(plain) == hashes(used)
+
+
+def test_where_only_a_reset_tells_the_actions_there_is_no_state_before_the_first_one():
+    loop = corridor_loop()
+    with pytest.raises(PartError, match="there is no Q-table yet"):
+        loop.execute.state()
+    loop.run(1)
+    assert loop.execute.state()[1].actions
 
 
 def test_a_state_that_was_given_does_not_change_with_what_is_driven_after_it():

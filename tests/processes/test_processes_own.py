@@ -145,7 +145,9 @@ def own(here):
 
 
 def plant(folder, name, episodes):
-    return write_config(folder, {"name": "plant", "episodes": episodes, "system": {"id": f"own_parts:{name}-v0", "retries": 1}})
+    return write_config(
+        folder, {"name": "plant", "episodes": episodes, "system": {"id": f"own_parts:{name}-v0", "retries": 1}}
+    )
 
 
 def gridworld(folder, episodes):
