@@ -92,9 +92,7 @@ def test_the_system_goes_on_while_the_loop_is_dead_and_is_caught_up_with(here, d
     assert last(log) == (total,) * 4
     old = ages(log)
     assert len(old) == total
-    assert min(old[number] for number in range(1, killed_at)) < 20
     assert old[back_at] >= back_at - killed_at - 50
-    assert min(old[number] for number in range(caught_up_at - 20, total + 1)) < 20
     with store(log) as opened:
         assert opened.dropped(0) == []
 

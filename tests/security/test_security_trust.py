@@ -37,14 +37,14 @@ gymnasium.register("Theirs-v0", "gymnasium.envs.toy_text.frozen_lake:FrozenLakeE
 """
 SYSTEM = {"id": "mapek/Gridworld-v0"}
 TABLE = {"name": "small", "episodes": 5, "system": SYSTEM, "monitor": {"detectors": ["page_hinkley"]}}
-OF_A_PART = {**TABLE, "monitor": {"detectors": ["theirs:Own"]}}
-OF_A_SYSTEM = {**TABLE, "system": {"id": "theirs:Theirs-v0"}}
-OF_A_SWAP = {**TABLE, "swap": [{"pass": 3, "part": "monitor", "to": "theirs:Own"}]}
+OF_A_PART = {**TABLE, "monitor": {"detectors": ["strangers:Own"]}}
+OF_A_SYSTEM = {**TABLE, "system": {"id": "strangers:Theirs-v0"}}
+OF_A_SWAP = {**TABLE, "swap": [{"pass": 3, "part": "monitor", "to": "strangers:Own"}]}
 
 
 @pytest.fixture
 def here(own_folder):
-    (own_folder / "theirs.py").write_text(MARKED)
+    (own_folder / "strangers.py").write_text(MARKED)
     return own_folder
 
 
@@ -92,7 +92,7 @@ def test_resume_lists_what_a_foreign_folder_runs_and_imports_nothing(here, capsy
     way(folder)
     code, said = mapek(capsys, "resume", folder)
     assert code == 2
-    assert all(word in said for word in ("'theirs'", "config.json", str(here), "--trust"))
+    assert all(word in said for word in ("'strangers'", "config.json", str(here), "--trust"))
     assert not (here / "mark").exists()
 
 
@@ -107,7 +107,7 @@ def test_replay_lists_what_a_foreign_folder_runs_and_imports_nothing(here, capsy
     for name in names:
         code, said = mapek(capsys, "replay", name)
         assert code == 2
-        assert "'theirs'" in said
+        assert "'strangers'" in said
         assert "--trust" in said
         assert not (here / "mark").exists()
     code, said = mapek(capsys, "replay", folder, "--trust", "-q", *(["--workers", 1] if command == "run" else []))
@@ -128,7 +128,7 @@ def test_who_continues_a_foreign_folder_by_out_is_asked_too(here, capsys, comman
     (folder / "manifest.json").chmod(0o666)
     code, said = mapek(capsys, command, "config.json", "--out", folder, *SHORT)
     assert code == 2
-    assert "'theirs'" in said
+    assert "'strangers'" in said
     assert not (here / "mark").exists()
     assert mapek(capsys, command, "config.json", "--out", folder, "--trust", *SHORT)[0] == 0
 
@@ -136,12 +136,12 @@ def test_who_continues_a_foreign_folder_by_out_is_asked_too(here, capsys, comman
 def test_a_part_that_a_log_says_was_swapped_in_is_listed(here, capsys):
     folder = finished(here, TABLE, "up")
     with Store(folder / "log.sqlite") as store:
-        store.keep_swap(Swap(0, 3, "monitor", {"name": "theirs:Own"}, False, False))
+        store.keep_swap(Swap(0, 3, "monitor", {"name": "strangers:Own"}, False, False))
         store.commit()
     open_to_others(folder)
     code, said = mapek(capsys, "replay", folder)
     assert code == 2
-    assert "'theirs'" in said
+    assert "'strangers'" in said
     assert not (here / "mark").exists()
 
 
@@ -195,7 +195,7 @@ def test_at_a_terminal_it_is_asked_for(here, answer):
     folder = begun(here, OF_A_PART)
     open_to_others(folder)
     said, code = at_a_terminal(here, answer, "resume", str(folder), "--workers", "1", "-q")
-    assert "'theirs'" in said
+    assert "'strangers'" in said
     assert (code, (here / "mark").exists(), (folder / "result.json").exists()) == (
         (0, True, True) if answer == "y" else (2, False, False)
     ), said
