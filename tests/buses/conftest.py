@@ -13,7 +13,7 @@ sys.path.append(str(Path(__file__).parent))
 from bus_peers import Site
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="module", autouse=True)  # a folder without `__init__.py` is no package that would end
 def anybody_may_say_anything():
     """What is asked here is held against Knowledge itself: whom its list lets through stands in tests/security."""
     with mock.patch.object(security, "access_control", return_value={"enabled": False}):
