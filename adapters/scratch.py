@@ -13,11 +13,15 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 PREFIX = "mapek-"
 LOCK = ".mapek-lives"
+
+LOOK_EVERY = 0.01
+"""Seconds between two looks whether an owner is gone."""
 
 
 @contextlib.contextmanager
@@ -39,18 +43,38 @@ def scratch(place: str | None = None) -> Iterator[Path]:
         yield Path(made)
 
 
-def remove_orphan(folder: Path) -> None:
-    """Remove a folder of `scratch` whose owner is gone; any other one stays."""
-    with contextlib.suppress(OSError):
+def remove_orphan(folder: Path, within: float = 0.0) -> None:
+    """Remove a folder of `scratch` whose owner is gone; any other one stays.
+
+    Parameters
+    ----------
+    folder
+        Which.
+    within
+        Seconds that an owner who is just being killed has: the kernel closes its files one after the other.
+    """
+    until = time.monotonic() + within
+    while not _removed(folder) and time.monotonic() < until:
+        time.sleep(LOOK_EVERY)
+
+
+def _removed(folder: Path) -> bool:
+    """Remove a folder whose owner is gone; say whether there is nothing left to wait for."""
+    try:
         found = os.lstat(folder)
         if not folder.name.startswith(PREFIX) or not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-            return
+            return True
         lock = os.open(folder / LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises where the owner lives
             shutil.rmtree(folder, ignore_errors=True)
         finally:
             os.close(lock)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 @contextlib.contextmanager

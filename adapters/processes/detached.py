@@ -146,8 +146,13 @@ class Detached:
         """Receive no more of `loop`."""
         self._do(partial(self._member.unwatch, loop))
 
-    def settle(self) -> None:
+    def settle(self, within: float | None = None) -> None:
         """Wait until all is said and acknowledged; nothing is said afterwards.
+
+        Parameters
+        ----------
+        within
+            Seconds after which it is given up, without a word; None for never.
 
         Raises
         ------
@@ -155,7 +160,7 @@ class Detached:
             As `Member.settle`.
         """
         self._do(self._finish)
-        self._thread.join()
+        self._thread.join(within)
         self._raise()
 
     def _do(self, job: Callable[[], object]) -> None:

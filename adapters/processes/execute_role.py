@@ -84,10 +84,13 @@ class ExecuteRole(Role):
 
     def leave(self) -> None:
         """Wait until all is acknowledged; of a plant for a while even if this role is to stop, for it has no other."""
-        if self.stopping.is_set() and not all(system.redrivable for system in self.systems):
+        if self.stopping.is_set() and self._cannot_drive_again():
             with suppress(BusError):
                 self.member.settle(SETTLES_WITHIN)
         super().leave()
+
+    def _cannot_drive_again(self) -> bool:
+        return not all(system.redrivable for system in self.systems)
 
     def begin(self) -> None:
         """Make each loop's component, and restore it."""
@@ -183,7 +186,9 @@ class ExecuteRole(Role):
             return
         last = self.member.joined.last[unit.loop][0]
         attempts.go_on_after(last + 1, self.member.joined.failed[unit.loop])
-        if not system.redrivable and self.member.joined.begun[unit.loop] >= number:
+        if not system.redrivable and (begun := self.member.joined.begun[unit.loop]) >= number:
+            for later in range(begun, number, -1):  # of one that runs freely, driven and not heard of
+                breaks_off(later, BROKEN_OFF.format(later))
             attempts.broken_off(number, ManagedSystemError(f"{system.name}: {BROKEN_OFF.format(number)}."))
 
     def _handle(self, unit: Unit, record: Record) -> None:
@@ -310,9 +315,9 @@ class FreeExecuteRole(ExecuteRole):
                 self._catch_up(unit)
             with Detached(self.member) as link:
                 self.member = cast(Member, link)  # all of it that is used from here on
-                self._drive_all(rate)
+                self._drive_all(rate, link)
 
-    def _drive_all(self, rate: float) -> None:
+    def _drive_all(self, rate: float, link: Detached) -> None:
         due = time.monotonic()
         while not self.stopping.is_set() and not all(unit.done for unit in self.units):
             self._hear(due, 0.5 / rate)
@@ -326,7 +331,9 @@ class FreeExecuteRole(ExecuteRole):
                 self._tick(unit)
         self._refuse_all()
         if not self.stopping.is_set():
-            self.member.settle()
+            link.settle()
+        elif self._cannot_drive_again():
+            link.settle(SETTLES_WITHIN)
 
     def _hear(self, due: float, most: float) -> None:
         """Put in force what comes until the next episode is due; of what has come, for a while even if it is."""

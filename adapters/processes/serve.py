@@ -101,7 +101,7 @@ def leash(folder: Path | None = None) -> threading.Event:
             while os.read(0, 4096):
                 released.set()
         if folder is not None:
-            remove_orphan(folder)
+            remove_orphan(folder, ENDS_WITHIN)
         os.kill(os.getpid(), signal.SIGTERM)
         # A part may keep to itself what ends it. Nobody else would say the last word now.
         time.sleep(ENDS_WITHIN)

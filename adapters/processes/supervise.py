@@ -2,7 +2,8 @@
 
 Who died by a signal is started again at once. Where the system broke an episode off, Execute itself has begun it again
 as often as the config says (`mape.execute.attempts`), and the run ends. Who ended with another error gets one more try,
-for the error may have been the world's; where it comes again at the same place, the run ends with it. So it does where
+for the error may have been the world's, and Execute one for each retry of the config besides, for it may have been the
+system that ended the process; where it comes again at the same place, the run ends with it. So it does where
 Knowledge fails again soon: with the disk full, each start of it makes room for a few passes more. Who is alive and says
 nothing for too long is hung: it is killed, and started again. Execute speaks while it drives, however long an episode
 takes, and ends itself where a step does not return.
@@ -14,12 +15,12 @@ place there may be that of another run.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
@@ -52,7 +53,7 @@ STARTS_WITHIN = 30.0
 """Seconds that a process has for its start at least, before its silence counts."""
 
 CRASHES = 10
-"""So many deaths of one role without a pass in between, and the run is given up."""
+"""So many deaths of one role without a pass in between, and the run is given up; of Execute, its retries more."""
 
 KEEPS_FAILING = 60.0
 """Seconds within which a second error of Knowledge is the first one's, however many passes lie between."""
@@ -84,8 +85,10 @@ class Child:
         self.starts = 0
         self.process: subprocess.Popen[bytes] | None = None
         self.started_at = 0.0
-        self.deaths: deque[tuple[float, int]] = deque(maxlen=CRASHES)
-        self.failed: tuple[float, int] | None = None  # when it last ended with an error, and after how many passes
+        self.place = 0.0, -1  # when it died first where it died last, and after how many passes that was
+        self.deaths = 0  # there
+        self.failures = 0  # those of them that were an end with an error
+        self.failed_at = -math.inf
         self.hung = 0
         self.killed = False  # it may take a moment until it is gone
         self.released = False
@@ -167,6 +170,8 @@ class Supervisor:
         Folder for what they write.
     hang_after
         Seconds after which a process that is alive and silent is taken for hung.
+    retries
+        How often the config has an episode begun again that the managed system breaks off.
     tell
         Told, as a sentence, what is done about a process.
     """
@@ -178,10 +183,12 @@ class Supervisor:
         logs: Path,
         *,
         hang_after: float = 60.0,
+        retries: int = 0,
         tell: Callable[[str], object] = lambda sentence: None,
     ) -> None:
         self.wire = wire
         self.hang_after = hang_after
+        self.retries = retries
         self.tell = tell
         self.children = {role: Child(role, command, logs / f"{role}.log") for role, command in commands.items()}
         self.status: Status | None = None
@@ -252,21 +259,23 @@ class Supervisor:
             raise ConfigError(_last_sentence(child))
         if code == SYSTEM_FAILED:
             raise Failed(_last_sentence(child))
+        if child.role != KNOWLEDGE:
+            self._asked_at = -math.inf
+            self._ask()  # how far it came, Knowledge may have been told since it was asked last
         now = time.monotonic()
         if code == HUNG:
             self.tell(f"{child.role} (process {child.pid}) ended itself: {_last_sentence(child)} It is started again.")
             child.start()
             return
-        child.deaths.append((now, self._passes))
-        if code >= 0:
-            again = self._again(child, now)
-            child.failed = (now, self._passes)
-            if again:
-                raise Failed(f"{child.role} failed twice {again}: {self._failure(child, code)}")
-        if len(child.deaths) == CRASHES and child.deaths[0][1] == self._passes:
+        if child.place[1] != self._passes:
+            child.place, child.deaths, child.failures = (now, self._passes), 0, 0
+        child.deaths += 1
+        if code >= 0 and (again := self._again(child, now)):
+            raise Failed(f"{child.role} failed {again}: {self._failure(child, code)}")
+        if child.deaths >= CRASHES + self._retries_of(child):
             raise Failed(
-                f"{child.role} died {CRASHES} times within {now - child.deaths[0][0]:.0f} s, without a pass in between "
-                f"({self._why(child, code)}): {_last_sentence(child)}"
+                f"{child.role} died {child.deaths} times within {now - child.place[0]:.0f} s, without a pass in "
+                f"between ({self._why(child, code)}): {_last_sentence(child)}"
             )
         child.start()
 
@@ -278,14 +287,15 @@ class Supervisor:
         return status is not None and status.roles[child.role].last_pass >= status.episodes
 
     def _again(self, child: Child, now: float) -> str:
-        """Say in how far an error that came now is the last one again; empty where it is another, or the first."""
-        if child.failed is None:
-            return ""
-        failed_at, passes = child.failed
-        if passes == self._passes:
-            return "at the same place"
-        apart = now - failed_at
-        return f"within {apart:.0f} s" if child.role == KNOWLEDGE and apart < KEEPS_FAILING else ""
+        """Say in how far an error that came now is the last ones again; empty where the child gets another try."""
+        apart, child.failed_at = now - child.failed_at, now
+        child.failures += 1
+        if child.failures > 1 + self._retries_of(child):
+            return f"{'twice' if child.failures == 2 else f'{child.failures} times'} at the same place"
+        return f"twice within {apart:.0f} s" if child.role == KNOWLEDGE and apart < KEEPS_FAILING else ""
+
+    def _retries_of(self, child: Child) -> int:
+        return self.retries if child.role == "execute" else 0
 
     @staticmethod
     def _failure(child: Child, code: int) -> str:
@@ -400,5 +410,5 @@ def _sentence(text: str) -> str:
 
 
 def command_of(role: str, config: Path, *options: str) -> list[str]:
-    """Return the command line of a process."""
-    return [sys.executable, "-m", "mape", "serve", str(config), "--role", role, "--leash", *options]
+    """Return the command line of a process; nothing in the present folder takes the place of what it imports."""
+    return [sys.executable, "-P", "-m", "mape", "serve", str(config), "--role", role, "--leash", *options]

@@ -41,7 +41,8 @@ def go_on(ledger: Ledger) -> None:
     For whoever lets a run go on: that an episode is begun anew is what was asked for.
     """
     for loop in range(ledger.units):
-        if (number := begun(ledger.store, loop)) > ledger.last(loop)[0]:
+        # Who runs freely may have driven several of which no Observation came.
+        for number in range(begun(ledger.store, loop), ledger.last(loop)[0], -1):
             breaks_off(ledger, f"{BROKEN_OFF.format(number)}; it is begun anew", loop, number)
     if ledger.store.facts().get(_FAILED):
         ledger.store.set_facts(**{_FAILED: {}})

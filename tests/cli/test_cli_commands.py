@@ -232,7 +232,11 @@ def test_version_names_what_the_bits_depend_on(mapek: Mapek) -> None:
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("list",), ("run", "nowhere.toml")], ids=" ".join)
-def test_python_m_mape_is_the_console_script(here: Path, arguments: tuple[str, ...]) -> None:
+def test_python_m_mape_is_the_console_script_whatever_lies_where_one_stands(
+    here: Path, arguments: tuple[str, ...]
+) -> None:
+    (here / "mapek").mkdir()
+    (here / "random.py").write_text("raise OSError('not the random of Python')")
     script, module = (
         subprocess.run([*start, *arguments], capture_output=True, text=True, timeout=60, cwd=here, check=False)
         for start in ((BESIDE_PYTHON,), (sys.executable, "-m", "mape"))

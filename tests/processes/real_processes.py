@@ -220,8 +220,8 @@ def end_all(served: dict[str, Started], within: float = DEADLINE) -> None:
         return None not in codes or any(codes)
 
     until(ended_or_failed, f"the end of {', '.join(f'{r} ({p.said[-300:]})' for r, p in served.items())}", within)
-    for process in served.values():
-        process.end()
+    for process in sorted(served.values(), key=lambda process: not process.process.poll()):
+        process.end()  # first of whoever failed: the others may wait for it
 
 
 @contextmanager

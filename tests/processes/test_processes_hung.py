@@ -274,6 +274,22 @@ def test_who_joins_while_the_supervisor_is_stopped_is_not_taken_for_one_that_nev
     assert (watched.restarts, watched.told) == ({}, [])
 
 
+FAILS = [sys.executable, "-S", "-c", "raise SystemExit('mapek: the valve is stuck')"]
+
+
+@pytest.mark.parametrize(("role", "retries", "times"), [("execute", 0, 2), ("execute", 2, 4), ("plan", 2, 2)])
+def test_who_fails_again_at_the_same_place_ends_the_run_and_execute_where_no_retry_is_left(
+    here, monkeypatch, role, retries, times
+):
+    watched = Watched(here, monkeypatch, hang_after=1000.0)
+    watched.supervisor.retries = retries
+    watched.supervisor.children[role].command[:] = FAILS
+    said = f"{role} failed {'twice' if times == 2 else f'{times} times'} at the same place: the valve is stuck"
+    with pytest.raises(Failed, match=said):
+        watched.watch()
+    assert watched.restarts == {role: times - 1}
+
+
 DIES = """
 import pathlib, time
 while not pathlib.Path("die").exists():
@@ -281,6 +297,28 @@ while not pathlib.Path("die").exists():
 pathlib.Path("die").unlink()
 raise SystemExit("mapek: log.sqlite cannot be written")
 """
+
+
+def test_who_fails_again_a_pass_later_has_not_failed_at_the_same_place_however_long_ago_knowledge_was_asked(
+    here, monkeypatch
+):
+    monkeypatch.chdir(here)
+    watched = Watched(here, monkeypatch, hang_after=1000.0)
+    watched.supervisor.children["execute"].command[:] = [sys.executable, "-S", "-c", DIES]
+    died = []
+
+    def fail_twice(watched):
+        restarts = watched.restarts.get("execute", 0)
+        if watched.supervisor.status is not None and restarts == len(died) < 2:
+            monkeypatch.setattr(supervise, "STATUS_EVERY", 10**9)
+            if died:
+                watched.make_a_pass()
+            died.append(restarts)
+            (here / "die").touch()
+        return restarts == 2
+
+    with pytest.raises(Enough):
+        watched.watch(fail_twice)
 
 
 SOON = (supervise.KEEPS_FAILING / 2, Failed, "knowledge failed twice within 30 s: log.sqlite cannot be written")

@@ -2,12 +2,14 @@
 
 import json
 import sqlite3
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from itertools import permutations
+from pathlib import Path
 
 import pytest
-from real_processes import EXAMPLES, ROLES, alone, end_all, endpoint, events, hashes, serve, until, write_config
+from real_processes import EXAMPLES, ROLES, alone, end_all, endpoint, events, hashes, serve, until, up, write_config
 
 from mape import load
 from mape.errors import MapekError
@@ -75,3 +77,12 @@ def test_the_processes_start_in_any_order(here):
 def test_the_processes_start_in_all_orders(here):
     done = [waits(order, said) for at, order, said in starts(here, list(permutations(ROLES))) if at % 2 == 0]
     assert len(done) == 60
+
+
+def test_what_lies_where_one_stands_takes_the_place_of_no_module_of_the_five(here):
+    config = write_config(here, json.loads(load(EXAMPLES / "gridworld_goals.toml", overrides=["episodes=5"]).to_json()))
+    for name in ("mapek", "mape", "adapters"):
+        (here / name).mkdir()
+    (here / "random.py").write_text("raise OSError('not the random of Python')")
+    with up(config, start=(str(Path(sys.executable).with_name("mapek")),)) as running:
+        assert hashes(running.result()) == alone(config)
