@@ -291,9 +291,11 @@ class Wire:
         Raises
         ------
         Unanswered, ConfigError
-            As `join`; of a slow network after the patience.
+            As `join`; of a slow network after the patience, of this machine at once.
         """
-        patience, until = RoundTrip(self.patience), time.monotonic() + max(least, self.patience)
+        patience, until = RoundTrip(self.patience), time.monotonic()
+        if not endpoints.on_this_machine(endpoints.reached(self.endpoint, self.tls is not None)):
+            until += max(least, self.patience)
         while True:
             try:
                 return self.join(role, patience.within(least))
