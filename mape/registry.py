@@ -87,10 +87,7 @@ def register(kind: str, name: str, target: str, summary: str) -> None:
 
 
 def look_here() -> None:
-    """Let modules in the present folder be found, and after all others those of the examples.
-
-    The console script does not look here; `python -m` does.
-    """
+    """Let modules in the present folder be found, after installed ones, and after all others those of the examples."""
     for folder in (os.getcwd(), last := str(examples())):
         if folder not in sys.path:
             sys.path.insert(sys.path.index(last) if last in sys.path else len(sys.path), folder)

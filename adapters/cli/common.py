@@ -16,29 +16,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adapters.cli.main import OutputError
-from adapters.cli.trust import check_trust
-from adapters.experiments.runner import Checked, announce_compilation, check
-from adapters.experiments.statistics import finite
-from adapters.results import RunFolder
-from adapters.results.files import cannot_write, try_whole, write_json
-from adapters.results.folder import default_path
-from adapters.systems.lending import Lender
-from mape import ctrl_c
+from mape import compose, ctrl_c
 from mape.config import Config, load
 from mape.config_files import find_config
 from mape.errors import ConfigError, ResultsError
 from mape.parts import cautions
 from mape.tables import parse_override
 
-if TYPE_CHECKING:
-    from adapters.buses.wire import Wire  # and with it Zenoh, which most commands do without
+if TYPE_CHECKING:  # `mapek serve` does without systems and results, most commands without Zenoh
+    from adapters.buses.wire import Wire
+    from adapters.experiments.runner import Checked
+    from adapters.results import RunFolder
+    from adapters.systems.lending import Lender
 
 
 def prepare() -> None:
     """Make long compilations heard, and the end of the process quick."""
     # Python looks for garbage a last time, among all that Numba keeps, which takes longer than many a run.
     atexit.register(gc.freeze)
-    announce_compilation()
+    if not compose.on_compile:
+        compose.on_compile.append(lambda sentence: print(sentence, file=sys.stderr))
     if not ctrl_c.on_wait:
         ctrl_c.on_wait.append(lambda sentence: print(f"mapek: {sentence}", file=sys.stderr, flush=True))
 
@@ -71,12 +68,18 @@ def open_folder(
     name: str,
     configs: Mapping[str, Config],
     trace: tuple[int, int] | None = None,
-    check: Callable[[Config], object] = check,
+    check: Callable[[Config], object] | None = None,
 ) -> RunFolder:
     """Open the folder that the command line names, or a new one, and say if it is continued.
 
     What is wrong with a config is said before: no folder is begun that could not be gone on with.
     """
+    from adapters.cli.trust import check_trust
+    from adapters.experiments import runner
+    from adapters.results import RunFolder
+    from adapters.results.folder import default_path
+
+    check = check or runner.check
     check_json_target(chosen)
     if chosen.out and os.path.exists(chosen.out) and not os.path.isdir(chosen.out):
         raise ConfigError(f"--out {chosen.out!r} is a file; name a folder, which may be new")
@@ -103,6 +106,8 @@ def caution(configs: Iterable[Config]) -> None:
 
 def looking(lend: Lender) -> Callable[[Config], Checked]:
     """Return a check of configs that looks at the systems which `lend` lends afterwards."""
+    from adapters.experiments.runner import check
+
     return functools.partial(check, lend=lend)
 
 
@@ -161,6 +166,8 @@ def check_name(agent: str) -> None:
 
 def check_json_target(chosen: argparse.Namespace) -> None:
     """Refuse a --json that cannot be written before the work is done, not after."""
+    from adapters.results.files import try_whole
+
     if chosen.json in (None, "-"):
         return
     path = Path(chosen.json)
@@ -198,6 +205,9 @@ def say(chosen: argparse.Namespace, text: str = "") -> None:
 
 def finish(chosen: argparse.Namespace, folder: RunFolder, result: Mapping[str, Any], figures: list[Path]) -> None:
     """Write the result beside the tables and where --json wants it, and say where all is."""
+    from adapters.experiments.statistics import finite
+    from adapters.results.files import cannot_write, write_json
+
     result = finite(dict(result))
     folder.finish(result)
     if chosen.json == "-":

@@ -9,7 +9,6 @@ import multiprocessing
 import multiprocessing.connection
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -26,7 +25,7 @@ from adapters.results.folder import assemble
 from adapters.systems import make_system
 from adapters.systems.declared import declared, is_plant
 from adapters.systems.lending import Lender
-from mape import compose, ctrl_c
+from mape import ctrl_c
 from mape.config import Config
 from mape.errors import MapekError
 from mape.loop import Loop
@@ -323,12 +322,6 @@ def _leave_with_parent() -> None:
     assert parent is not None
     multiprocessing.connection.wait([parent.sentinel])
     os._exit(1)
-
-
-def announce_compilation() -> None:
-    """Say on standard error when something is compiled that is not in the cache."""
-    if not compose.on_compile:
-        compose.on_compile.append(lambda sentence: print(sentence, file=sys.stderr))  # noqa: T201
 
 
 def drifts_of(config: Config) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ import gymnasium
 from gymnasium.envs.registration import load_env_creator
 
 from managed_systems import register_envs
+from mape import registry
 from mape.config import SystemConfig
 from mape.states import faults
 
@@ -19,6 +20,7 @@ def declared(config: SystemConfig, name: str) -> Any:
     Whatever is wrong with the environment is said where one is made.
     """
     register_envs()
+    registry.look_here()
     module, _, env_id = config.id.rpartition(":")
     try:
         if module:

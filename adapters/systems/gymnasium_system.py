@@ -21,6 +21,7 @@ from adapters.systems.tabulated import Tabulated
 from adapters.systems.wrappers import altering_wrapper, step_cap, step_caps
 from managed_systems import register_envs
 from managed_systems.rules import available
+from mape import registry
 from mape.config import SystemConfig
 from mape.errors import ConfigError, ManagedSystemError, UnknownName
 from mape.ports import Episode, StepRules
@@ -60,6 +61,7 @@ def make_env(config: SystemConfig) -> gymnasium.Env[Any, Any]:
 
 def _make_by_id(config: SystemConfig) -> gymnasium.Env[Any, Any]:
     register_envs()
+    registry.look_here()
     try:
         # Gymnasium's passive checker would cost every step, and warn at every reset; `mapek check` looks once.
         return gymnasium.make(config.id, disable_env_checker=True, **config.options)

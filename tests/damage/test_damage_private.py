@@ -22,7 +22,9 @@ def modes(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): stat.S_IMODE(path.lstat().st_mode) for path in paths}
 
 
-@pytest.mark.parametrize("umask", ["000", "022", "777"])
+@pytest.mark.parametrize(
+    "umask", [pytest.param("000", marks=pytest.mark.long), "022", pytest.param("777", marks=pytest.mark.long)]
+)
 def test_files_have_mode_600_and_folders_700_whatever_the_umask(tmp_path: Path, umask: str) -> None:
     (tmp_path / "small.json").write_text(CONFIG.to_json())
     script = (

@@ -239,41 +239,28 @@ def _hashes(folder):
     return one["log_sha256"], one["q_table_sha256"]
 
 
-def test_the_readmes_processes_come_to_the_hashes_of_one_process(goals, served, alone):
+def test_the_readmes_processes_do_and_say_what_it_says_of_them(goals, served, here, alone):
+    """One test, as the five are started but once for it."""
     assert _hashes(goals) == _hashes(served[0]) == (alone.log_sha256, alone.q_table_sha256)
 
-
-def test_status_says_who_is_there_and_who_is_not(served):
     states = dict(re.findall(r"^(\w+) +(here|away)", served[1], flags=re.MULTILINE))
     assert states == dict.fromkeys(("execute", "monitor", "analyze", "knowledge"), "here") | {"plan": "away"}
 
-
-def test_knowledge_speaks_of_the_run_alone(served, here):
-    """And not of what draws its figures, which has much to say."""
+    # Knowledge speaks of the run alone, and not of what draws its figures, which has much to say.
     said = (here / "0.said").read_text()
     assert "Knowledge listens on" in said
     assert "INFO" in said
     assert "subset" not in said
 
-
-def test_each_drift_and_the_plan_that_answered_it_are_seen_while_the_run_goes_on_and_later(goals, served, here, alone):
+    # Each drift and the plan that answered it are seen while the run goes on, and later.
     (line,) = re.findall(r"`(python examples/watch_the_log.py \S+)`", README)
     for said in (served[2], _typed(line, here)):
         assert _passes(said) == [*alone.alarms]
         assert said.count("Analyze   return drifted down.") == said.count("epsilon 1.000") == len(alone.alarms)
-
-
-def test_watching_without_a_folder_says_how_it_is_done(here):
-    assert "watch_the_log.py DIR" in _typed("python examples/watch_the_log.py", here, code=1)
-
-
-def test_the_readmes_query_finds_the_drifts(goals, alone):
     ((file, query),) = re.findall(r'^sqlite3 (\S+) "(.*)"$', README, flags=re.MULTILINE)
     with contextlib.closing(sqlite3.connect(goals.parents[1] / file)) as log:
         assert [number for number, _ in log.execute(query)] == [*alone.alarms]
 
-
-def test_the_readmes_lines_for_a_folder_say_what_they_are_to(goals, served, here, alone):
     def typed(start, code=0):
         return [_typed(line, here, code) for line in _lines(start)]
 
@@ -285,6 +272,10 @@ def test_the_readmes_lines_for_a_folder_say_what_they_are_to(goals, served, here
     assert "--- after pass 303" in up_to
     (resumed,) = typed("mapek resume results", code=1)
     assert "nothing to continue" in resumed
+
+
+def test_watching_without_a_folder_says_how_it_is_done(here):
+    assert "watch_the_log.py DIR" in _typed("python examples/watch_the_log.py", here, code=1)
 
 
 def test_the_readmes_keys_are_made(here):

@@ -206,6 +206,7 @@ def rule(x):
 """
 
 
+@pytest.mark.long
 def test_all_that_rules_find_beside_their_arguments_is_seen_when_it_is_edited(tmp_path):
     texts = {
         "a_helper": HELPER, "a_constant": FOUND, "a_module": LOOKED_INTO, "a_decorator": DECORATOR, "a_rule": FINDING,

@@ -1,5 +1,6 @@
 """An episode that a plant breaks off is begun again as often as the config says, under every command, and is told."""
 
+import functools
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ from real_runs import run
 pytestmark = pytest.mark.timeout(120)
 
 SHORT = ("--no-figures", "-q")
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 AT = 7
 """The episode that is broken off."""
 
@@ -37,8 +39,10 @@ def undisturbed(tmp_path_factory):
     return log_of(folder / "out")
 
 
-@pytest.mark.parametrize("command", ["run", "up"])
-@pytest.mark.parametrize(("step", "times"), [(2, 1), (0, 1), (3, 2)], ids=["step", "reset", "twice"])
+@pytest.mark.parametrize(
+    ("command", "step", "times"),
+    [("run", 2, 1), ("run", 0, 1), ("run", 3, 2), LONG("up", 2, 1), LONG("up", 0, 1), ("up", 3, 2)],
+)
 def test_an_episode_that_raises_is_begun_again_by_another_object_and_each_attempt_is_an_event(
     here, undisturbed, command, step, times
 ):
@@ -57,8 +61,7 @@ def test_an_episode_that_raises_is_begun_again_by_another_object_and_each_attemp
     assert log_of(here / "out") == undisturbed
 
 
-@pytest.mark.parametrize("command", ["run", "up"])
-@pytest.mark.parametrize("retries", [0, 1])
+@pytest.mark.parametrize(("command", "retries"), [("run", 0), LONG("run", 1), LONG("up", 0), ("up", 1)])
 def test_a_run_ends_where_no_retry_is_left_and_resume_goes_on_with_that_episode(here, undisturbed, command, retries):
     config = write_config(here, broken("raise", 2, retries + 1, retries))
     said = run(command, str(config), "--out", "out", *SHORT, cwd=here, code=1).stderr
@@ -86,7 +89,7 @@ def test_a_run_that_dies_in_an_episode_goes_on_with_it(here, undisturbed):
     assert log_of(here / "out") == undisturbed
 
 
-@pytest.mark.parametrize("retries", [1, 2])
+@pytest.mark.parametrize("retries", [LONG(1), 2])
 def test_an_execute_that_dies_in_an_episode_is_begun_again_as_often_as_the_config_says(here, undisturbed, retries):
     config = write_config(here, broken("die", 2, retries, retries))
     run("up", str(config), "--out", "out", *SHORT, cwd=here)
@@ -154,7 +157,7 @@ def test_compare_over_plants_goes_on_too_and_has_a_log_for_each_agent(here):
     assert len(resets(here)) == 2 * EPISODES + 1
 
 
-@pytest.mark.parametrize("command", ["run", "up"])
+@pytest.mark.parametrize("command", ["run", LONG("up")])
 def test_a_system_that_can_be_driven_again_has_the_same_rule(here, command):
     config = write_config(here, broken("raise", 2, 1, 0, name="Tank"))
     said = run(command, str(config), "--out", "out", *SHORT, cwd=here, code=1).stderr
@@ -170,6 +173,7 @@ def test_a_system_that_can_be_driven_again_has_the_same_rule(here, command):
     assert [one["episode"] for one in result["trials"][0]["aborted"]] == [AT]
 
 
+@pytest.mark.long
 def test_a_planner_that_reads_the_table_reads_it_as_it_was_when_the_run_goes_on(here):
     (here / "reading.py").write_text(
         "from mape.plan.morphin import Morphin\n\n\n"

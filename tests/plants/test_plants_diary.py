@@ -29,6 +29,7 @@ def test_run_makes_each_unit_a_plant_when_the_one_before_is_closed(here, options
     assert diary(here) == one_by_one(1, EPISODES) * units
 
 
+@pytest.mark.long
 def test_compare_drives_one_agent_after_the_other(here):
     agents = {"agents": {"one": {}, "other": {"plan": {"name": "q_learning"}}}}
     config = write_config(here, {**plant(), **agents})
@@ -128,6 +129,7 @@ gymnasium.register("Line-v0", Line, max_episode_steps=3)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["run", "up"])
 def test_a_plant_that_connects_when_it_is_made_is_connected_once(here, command):
     (here / "line.py").write_text(CONNECTS_WHEN_MADE)

@@ -23,7 +23,7 @@ def hangs(times, retries, name="Pump"):
     return plant(name=name, system={"options": {"faults": [["hang", AT, 2, times]]}, "retries": retries})
 
 
-@pytest.mark.parametrize("name", ["Pump", "Tank"])
+@pytest.mark.parametrize("name", ["Pump", pytest.param("Tank", marks=pytest.mark.long)])
 def test_an_episode_whose_step_hangs_is_begun_again_as_often_as_the_config_says(here, name):
     config = write_config(here, hangs(1, 1, name))
     with up(config, "--hang-after", "2") as running:
@@ -35,7 +35,7 @@ def test_an_episode_whose_step_hangs_is_begun_again_as_often_as_the_config_says(
     assert [one["episode"] for one in result["trials"][0]["aborted"]] == [AT]
 
 
-@pytest.mark.parametrize("name", ["Pump", "Tank"])
+@pytest.mark.parametrize("name", ["Pump", pytest.param("Tank", marks=pytest.mark.long)])
 def test_a_run_ends_where_a_step_hangs_once_too_often_and_resume_goes_on(here, name):
     config = write_config(here, hangs(1, 0, name))
     said = run("up", str(config), "--out", "out", "--hang-after", "1", *SHORT, cwd=here, code=1).stderr
@@ -183,7 +183,7 @@ def test_a_first_ctrl_c_where_a_worker_hangs_says_for_what_it_waits(here):
         process.end(130)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 def test_up_ends_at_once_while_a_step_hangs(here, number):
     config = write_config(here, hangs(1, 0))
     with up(config) as running:

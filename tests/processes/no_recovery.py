@@ -37,7 +37,7 @@ CUTS = {
 
 def command_of(role, config, *options):
     command = supervise.command_of(role, config, *options)
-    return [command[0], __file__, what, *command[3:]]
+    return [command[0], __file__, what, *command[command.index("serve") :]]
 
 
 if __name__ == "__main__":

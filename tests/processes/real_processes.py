@@ -42,7 +42,11 @@ def until(condition: Callable[[], T], what: str, within: float = DEADLINE, every
     return found
 
 
-def write_config(folder: Path, table: dict[str, Any], name: str = "config.json") -> Path:
+def write_config(folder: Path, table: dict[str, Any], name: str = "config.json", engine: str | None = "python") -> Path:
+    """Write a config; with an engine in the place of `auto`, as five processes take long to load what is compiled."""
+    execute = table.get("execute", {})
+    if engine is not None and execute.get("engine", "auto") == "auto":
+        table = {**table, "execute": {**execute, "engine": engine}}
     path = folder / name
     path.write_text(json.dumps(table))
     return path

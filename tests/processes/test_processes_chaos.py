@@ -37,7 +37,7 @@ def undisturbed(config, result, out="up"):
 
 def test_a_run_outlives_kills_of_all_roles_and_a_freeze(here):
     # The run goes on long after the last moment, for a blow may come up to a second after it.
-    config = example(here, "gridworld_goals", "episodes=2000", "system.options.switch_at=[101,301]")
+    config = example(here, "gridworld_goals", "episodes=1100", "system.options.switch_at=[101,301]")
     plan = blows(seed=7, total=600, kills=6, freezes=1, must=("knowledge", "execute", "plan"))
     result, done, _ = survive(config, plan, "--snapshot-every", "37")
     assert len(done) == len(plan)
@@ -65,6 +65,7 @@ def outcome(running, victim, moments):
     return hashes(json.loads((running.out / "result.json").read_bytes()))
 
 
+@pytest.mark.long
 def test_without_recovery_the_same_kills_are_noticed(here):
     """The control: what the tests above would see if one part of the recovery were missing."""
     config = example(here, "gridworld_goals", "episodes=300", "system.options.switch_at=[101]")

@@ -12,7 +12,7 @@ from real_runs import run, wait_until_gone
 from mape import load
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-SIGNALS = pytest.mark.parametrize("number", CODES)
+SIGNALS = pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 
 
 def gridworld(here, episodes, *overrides):
@@ -71,6 +71,7 @@ class KeepsOn(Changes):
 """
 
 
+@pytest.mark.long
 def test_a_part_that_lets_nothing_end_it_ends_all_the_same_when_up_is_killed(here, monkeypatch):
     monkeypatch.syspath_prepend(here)
     (here / "own_keeps_on.py").write_text(KEEPS_ON)
@@ -81,6 +82,7 @@ def test_a_part_that_lets_nothing_end_it_ends_all_the_same_when_up_is_killed(her
         wait_until_gone(children)
 
 
+@pytest.mark.long
 def test_a_signal_while_the_figures_are_drawn_is_heard_too(here):
     config = gridworld(here, 60)
     with up(config, short=("-q",)) as running:
@@ -91,6 +93,7 @@ def test_a_signal_while_the_figures_are_drawn_is_heard_too(here):
     assert "mapek resume" in running.process.said
 
 
+@pytest.mark.long
 def test_every_served_role_ends_at_once(here):
     config = gridworld(here, 100_000)
     ended = {}

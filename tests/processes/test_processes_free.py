@@ -61,7 +61,7 @@ def ages(log):
 @pytest.mark.parametrize(
     ("dead_for", "megabytes"),
     [
-        (400, 16),  # a busy machine may stand still for a moment
+        pytest.param(400, 16, marks=pytest.mark.long),  # a busy machine may stand still for a moment
         pytest.param(2000, 4, marks=pytest.mark.long),
     ],
 )
@@ -97,6 +97,7 @@ def test_the_system_goes_on_while_the_loop_is_dead_and_is_caught_up_with(here, d
         assert opened.dropped(0) == []
 
 
+@pytest.mark.long
 def test_what_a_small_backlog_drops_while_knowledge_is_away_is_one_row(here):
     config = free_config(here, round(RATE * 8), "execute.backlog=150")
     where, log = endpoint(here), here / "served" / "log.sqlite"

@@ -73,6 +73,7 @@ def test_execute_restarts_across_a_gap_of_dropped_episodes_that_have_no_plans(he
     assert refused(run.path) == []
 
 
+@pytest.mark.long
 def test_a_restarted_execute_puts_the_plans_in_force_that_came_while_it_was_behind_with_them(here, adopted):
     with Roles(free(1000), here, snapshot_every=20) as run:
         Paced.free.set()
@@ -100,6 +101,7 @@ def test_a_restarted_execute_puts_the_plans_in_force_that_came_while_it_was_behi
     assert refused(run.path) == []
 
 
+@pytest.mark.long
 def test_behind_a_rate_that_cannot_be_reached_plans_and_acknowledgements_are_heard(here):
     """In processes: on threads Execute would keep the others from their work."""
     backlog, total = 200, 8000

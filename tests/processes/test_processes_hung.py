@@ -144,7 +144,7 @@ def test_who_speaks_is_not_hung(here, monkeypatch):
     watched = Watched(here, monkeypatch, hang_after=0.8)
     looks = []
     with pytest.raises(Enough):
-        watched.watch(lambda watched: looks.append(1) or len(looks) > 100)
+        watched.watch(lambda watched: looks.append(1) or len(looks) > 40)
     assert (watched.restarts, watched.told) == ({}, [])
 
 

@@ -30,6 +30,7 @@ def address():
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+@pytest.mark.long
 def test_five_machines_with_keys_run_what_one_process_runs(here, address, walk):
     config = load(
         EXAMPLES / "gridworld_goals.toml",

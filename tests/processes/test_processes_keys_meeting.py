@@ -24,7 +24,7 @@ def config(here):
     return write_config(here, json.loads(config.to_json()))
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "[::]"])
+@pytest.mark.parametrize("host", ["0.0.0.0", pytest.param("[::]", marks=pytest.mark.long)])
 def test_up_that_listens_on_all_addresses_is_reached_by_its_own_roles(here, config, port, host):
     with up(config, "--tls", "keys", at=f"tcp/{host}:{port}") as running:
         assert hashes(running.result()) == alone(config)

@@ -52,6 +52,7 @@ def test_up_that_is_killed_leaves_no_temporary_folder(here, temporary):
     assert ours(temporary) == []
 
 
+@pytest.mark.long
 @linux
 def test_processes_that_are_left_behind_stopped_are_named_and_end_when_continued(here, temporary):
     config = gridworld(here, 400)

@@ -82,7 +82,7 @@ def free_port():
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-@pytest.mark.parametrize("over", ["tcp", "unix"])
+@pytest.mark.parametrize("over", ["tcp", pytest.param("unix", marks=pytest.mark.long)])
 def test_a_second_run_at_the_same_place_is_refused_at_once_and_the_first_is_unharmed(here, over):
     config = gridworld(here, 600)
     at = free_port() if over == "tcp" else endpoint(here)
@@ -154,6 +154,7 @@ def test_a_role_whose_system_exits_by_itself_fails_with_a_sentence(here, where, 
     assert "Traceback" not in said
 
 
+@pytest.mark.long
 def test_who_leaves_before_the_run_is_over_is_started_again(here, monkeypatch):
     config = leaving(here, monkeypatch, again=False)
     with up(config) as running:
@@ -164,6 +165,7 @@ def test_who_leaves_before_the_run_is_over_is_started_again(here, monkeypatch):
     assert hashes(result) == hashes(run_here(config))
 
 
+@pytest.mark.long
 def test_who_leaves_again_and_again_ends_the_run_with_a_sentence_that_names_the_way_on(here, monkeypatch):
     config = leaving(here, monkeypatch, again=True)
     with up(config) as running:

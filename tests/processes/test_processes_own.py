@@ -218,6 +218,7 @@ def test_a_system_that_wrongly_says_it_can_be_driven_again_is_found_out(own):
     assert all("Observation" in event.text for event in conflicts)
 
 
+@pytest.mark.long
 def test_a_handler_that_hangs_is_killed_and_done_again(own, monkeypatch):
     config = gridworld(own, 150)
     options = ("--set", "plan.name=own_parts:Hangs")
@@ -233,6 +234,7 @@ def test_a_handler_that_hangs_is_killed_and_done_again(own, monkeypatch):
     assert hashes(result) == hashes(run_here(config, *options))
 
 
+@pytest.mark.long
 def test_a_planner_that_reads_knowledge_sees_the_same_in_five_processes(own, walk):
     config = gridworld(own, 200)
     options = ("--set", "plan.name=own_parts:Reads", "--set", f"analyze.name={walk.part}")
@@ -249,6 +251,7 @@ def test_a_planner_that_reads_knowledge_sees_the_same_in_five_processes(own, wal
     assert "no difference" in replayed.stdout
 
 
+@pytest.mark.long
 def test_a_plant_that_runs_freely_does_not_wait_for_knowledge(own):
     """What it began is noted as it goes; nothing of that is waited for."""
     table = json.loads(plant(own, "Tells", 700).read_text())

@@ -52,6 +52,7 @@ def sentence(process: Started, code: int) -> str:
     return said[0]
 
 
+@pytest.mark.long
 def test_who_does_not_belong_to_a_run_is_told_and_nobody_is_disturbed(here):
     config = gridworld(here, "episodes=100000")
     with up(config) as running:

@@ -115,6 +115,7 @@ def plan_of(log, number):
     return record
 
 
+@pytest.mark.long
 def test_a_swap_is_what_the_config_would_have_said(config, walk):
     swaps = [
         ("plan", "own_parts:Gentle", {"name": "own_parts:Gentle"}),
@@ -149,6 +150,7 @@ def test_a_swap_is_what_the_config_would_have_said(config, walk):
     assert result["trials"][0]["alarms"] == told["trials"][0]["alarms"]
 
 
+@pytest.mark.long
 def test_a_swap_reaches_a_role_that_is_just_being_started_again(config, walk):
     with up(config) as running:
         running.wait_for_pass(60)
@@ -162,6 +164,7 @@ def test_a_swap_reaches_a_role_that_is_just_being_started_again(config, walk):
     assert [event.pass_no for event in events(running.log, "swapped")] == [pass_named(said)]
 
 
+@pytest.mark.long
 def test_a_swap_whose_answer_is_lost_is_asked_for_again_and_made_once(config, walk):
     asked = ("swap", "plan", "own_parts:Waits", "--connect")
     with up(config) as running:
@@ -209,6 +212,7 @@ def test_what_does_not_serve_is_refused_and_the_old_part_goes_on(config, walk):
     assert records(running.log) == {0: 4 * EPISODES + 1}
 
 
+@pytest.mark.long
 def test_a_part_that_fails_in_one_of_two_loops_is_told_so(config, walk):
     with up(config, "--set", "loops=2", "--set", "episodes=300") as running:
         running.wait_for_pass(30)

@@ -132,6 +132,7 @@ def test_sigterm_leaves_nothing_half_written_under_a_final_name(tmp_path: Path) 
         assert set(read_arrays(chunk.with_suffix(""))) == {f"q_{int(chunk.stem[:8])}", f"actions_{int(chunk.stem[:8])}"}
 
 
+@pytest.mark.long
 def test_a_second_run_into_a_folder_in_use_is_refused_and_the_first_ends_well(
     tmp_path: Path, undisturbed: Path
 ) -> None:

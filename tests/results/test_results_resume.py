@@ -30,7 +30,7 @@ from real_runs import (
 from replay_logs import edited
 
 from adapters.cli.main import main
-from adapters.results import RunFolder, read_episodes
+from adapters.results import RunFolder, files, read_episodes
 from mape.errors import ResultsError
 
 SMALL = """\
@@ -114,6 +114,7 @@ def wait_for_passes(process: "subprocess.Popen[str]", log: Path, passes: int) ->
         pause.wait(0.01)
 
 
+@pytest.mark.long
 def test_up_whose_supervisor_is_killed_goes_on_and_comes_to_what_run_comes_to(tmp_path: Path) -> None:
     lake = (str(FROZEN_LAKE), "--set", "episodes=1500", *QUIETLY)
     out = tmp_path / "out"
@@ -316,10 +317,13 @@ def test_ctrl_c_after_the_trials_names_the_folder_and_how_to_go_on(
 def test_ctrl_c_after_the_result_says_that_all_is_there(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupt(*arguments: object, **options: object) -> None:
-        raise KeyboardInterrupt
+    def write_json(path: Path, *arguments: Any, **options: Any) -> None:
+        if path.name == "found.json":
+            raise KeyboardInterrupt
+        written(path, *arguments, **options)
 
-    monkeypatch.setattr("adapters.cli.common.write_json", interrupt)
+    written = files.write_json
+    monkeypatch.setattr(files, "write_json", write_json)
     assert main(["run", "small.toml", *QUIETLY, "--json", "found.json", "--out", "out"]) == 130
     assert capsys.readouterr().err == "mapek: stopped. The run is complete; all of it is in out.\n"
 

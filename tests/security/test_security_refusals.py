@@ -87,6 +87,7 @@ def knock(port, times):
             over_tls.recv(1)
 
 
+@pytest.mark.long
 def test_of_a_flood_of_bad_handshakes_so_many_lines_are_logged_and_the_rest_is_counted(here, port):
     config = write_config(here, TABLE)
     say("keys", str(here / "keys"))

@@ -24,7 +24,9 @@ STRANGER = f"""
 import json, os, sys, tempfile
 import zenoh
 from adapters.buses import messages, security, tokens, wire
-from adapters.cli import common, main, serve, status, swap
+from adapters.cli import common, main, serve, status, swap, trust
+from adapters.experiments import runner, statistics
+from adapters.results import RunFolder, files
 from adapters.processes import roles, execute_role
 from adapters.systems import make_system
 from mape import load
@@ -42,7 +44,7 @@ own = tokens.make(endpoint, security.CLIENTS)  # a token, and not the run's
 evil = '{{name = "subprocess:Popen", args = ["touch", "' + mark + '"]}}'
 at = ["--connect", endpoint]
 codes = [main.main(["status", *at]), main.main(["status", *at, "--token", str(own)])]
-for part in ("monitor", "analyze", "plan", "learner"):
+for part in ("monitor", "learner"):
     codes.append(main.main(["swap", part, evil, *at]))
 codes.append(main.main(["serve", config, "--role", "knowledge", "--listen", endpoint]))
 
