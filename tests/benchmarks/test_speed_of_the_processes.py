@@ -102,6 +102,7 @@ def test_one_loop_in_lockstep(benchmark, request, capsys):
     assert all(figures["median_us"] > 0 for figures in found.values())
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_sixteen_loops_at_once(benchmark, capsys):
     passes, rounds = (600, ROUNDS) if benchmark.enabled else (10, 1)

@@ -2,6 +2,7 @@
 
 import threading
 
+import pytest
 from bus_peers import Site
 from bus_records import run_of
 
@@ -41,6 +42,7 @@ def test_a_slow_consumer_asks_about_once_per_full_answer(wire, monkeypatch):
     assert len(questions) <= 2 * (passes // limit)
 
 
+@pytest.mark.long
 def test_what_takes_its_time_is_sent_about_once(wire, monkeypatch):
     """An answer that takes longer than the first patience is waited for from then on, and not asked for ever again."""
     monkeypatch.setattr(outbox, "RESEND_AFTER", 0.02)

@@ -137,7 +137,7 @@ def test_an_execute_that_is_killed_between_two_episodes_has_broken_none_off(here
     assert resets(here) == [*range(1, EPISODES + 1)]
 
 
-@pytest.mark.parametrize("options", [(), ("--set", "loops=2"), ("--trials", "2")], ids=["one", "loops", "trials"])
+@pytest.mark.parametrize("options", [(), LONG(("--set", "loops=2")), ("--trials", "2")], ids=["one", "loops", "trials"])
 def test_a_stopped_run_over_plants_goes_on_with_its_next_episode(here, options):
     config = write_config(here, broken("raise", 1, 1, 0))
     run("run", str(config), "--out", "out", *SHORT, *options, cwd=here, code=1)

@@ -183,6 +183,7 @@ def test_a_first_ctrl_c_where_a_worker_hangs_says_for_what_it_waits(here):
         process.end(130)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 def test_up_ends_at_once_while_a_step_hangs(here, number):
     config = write_config(here, hangs(1, 0))

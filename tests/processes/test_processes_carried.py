@@ -89,7 +89,10 @@ def test_a_resumed_run_comes_to_the_hashes_of_one_that_was_never_stopped(here, s
     assert "carries total" in run("log", "up", "--events", cwd=here).stdout
 
 
-@pytest.mark.parametrize(("name", "carried"), [("Class", "Class.turns"), ("Module", "worn_worlds.MODULE")])
+@pytest.mark.parametrize(
+    ("name", "carried"),
+    [pytest.param("Class", "Class.turns", marks=pytest.mark.long), ("Module", "worn_worlds.MODULE")],
+)
 def test_what_a_whole_process_shares_is_refused_by_its_name(name, carried, here, stopped):
     stopped(name)
     said = run("resume", "up", cwd=here, code=1)

@@ -17,9 +17,9 @@ MORE = 150
     ("kind", "method"),
     [
         (Outbox, "_transmit"),  # what is sent waits in a queue that is full, as over a link that is cut
-        (Member, "beat"),
+        pytest.param(Member, "beat", marks=pytest.mark.long),
         (Member, "_keep_up"),  # a session that hears nothing is given up for another one, which takes its time
-        (Member, "_acknowledged"),
+        pytest.param(Member, "_acknowledged", marks=pytest.mark.long),
     ],
 )
 def test_the_system_is_driven_on_while_its_link_stands_still(here, monkeypatch, kind, method):

@@ -63,7 +63,7 @@ def refused(here, name):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("Exits", "SystemExit was raised: 5"),
+        pytest.param("Exits", "SystemExit was raised: 5", marks=pytest.mark.long),
         ("Interrupts", "KeyboardInterrupt"),
         ("InTheWay", "SystemExit: I am a script"),
     ],

@@ -44,8 +44,7 @@ own = tokens.make(endpoint, security.CLIENTS)  # a token, and not the run's
 evil = '{{name = "subprocess:Popen", args = ["touch", "' + mark + '"]}}'
 at = ["--connect", endpoint]
 codes = [main.main(["status", *at]), main.main(["status", *at, "--token", str(own)])]
-for part in ("monitor", "learner"):
-    codes.append(main.main(["swap", part, evil, *at]))
+codes.append(main.main(["swap", "monitor", evil, *at]))
 codes.append(main.main(["serve", config, "--role", "knowledge", "--listen", endpoint]))
 
 quiet = {{"enabled": False}}
