@@ -78,6 +78,7 @@ def medians(rounds, **variants):
     }
 
 
+@pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_one_loop_in_lockstep(benchmark, request, capsys):
     address, client = request.getfixturevalue("redis_server") if benchmark.enabled else ("", None)

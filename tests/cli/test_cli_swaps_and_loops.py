@@ -151,6 +151,7 @@ def test_a_run_of_one_loop_has_a_table_without_their_numbers(mapek: Mapek) -> No
         assert "loop" not in COLUMNS
 
 
+@pytest.mark.long
 def test_figures_are_drawn_of_all_loops(mapek: Mapek) -> None:
     outcome = mapek("run", GOALS, *LOOPS, "--trace", "1:12", "-q", "--out", "out")
 

@@ -16,7 +16,7 @@ def test_up_with_keys_asks_for_a_place_on_the_network(mapek, here):
     assert not (here / "run").exists()
 
 
-@pytest.mark.parametrize("folder", ["x" * 110, "a#b"])
+@pytest.mark.parametrize("folder", ["x" * 110, pytest.param("a#b", marks=pytest.mark.long)])
 def test_up_meets_elsewhere_where_the_temporary_folder_can_hold_no_socket(mapek, here, monkeypatch, folder):
     (here / folder).mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(here / folder))

@@ -102,7 +102,10 @@ def test_no_name_says_a_number_of_actions(ran: Run, drawn: dict[str, Any]) -> No
     assert not any(sign.isdigit() for name in names(ran, drawn, configs).values() for sign in name)
 
 
-@pytest.mark.parametrize(("loops", "unit", "of"), [(1, "trial", "trial 0"), (2, "loop", "trial 0, loop 0")])
+@pytest.mark.parametrize(
+    ("loops", "unit", "of"),
+    [(1, "trial", "trial 0"), pytest.param(2, "loop", "trial 0, loop 0", marks=pytest.mark.long)],
+)
 def test_figures_say_trial_or_loop_as_it_is(ran: Run, drawn: dict[str, Any], loops: int, unit: str, of: str) -> None:
     folder = ran({"morphin": grid(loops=loops), "other": grid(loops=loops)}, trace=(1, 5))
     compared(folder)

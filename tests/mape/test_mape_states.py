@@ -80,7 +80,7 @@ def outcome(loop, passes):
 
 @pytest.mark.parametrize("engine", ["compiled", "python"])
 @pytest.mark.parametrize("systems", [gridworlds(), junctions()], ids=["gridworld", "junction"])
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(st.data())
 def test_a_run_that_is_taken_up_after_any_pass_is_the_run_in_one_piece(systems, engine, data):
     table = data.draw(configs(systems))

@@ -1,5 +1,6 @@
 """Looking at a plant does not touch it: its diary over every command holds one reset for each logged episode."""
 
+import functools
 import json
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from real_runs import MAPEK, run
 pytestmark = pytest.mark.timeout(120)
 
 SHORT = ("--no-figures", "-q")
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 FREE = {"execute": {"mode": "free", "rate": 200.0}}
 
 
@@ -37,7 +39,7 @@ def test_compare_drives_one_agent_after_the_other(here):
     assert diary(here) == one_by_one(1, EPISODES) * 4
 
 
-@pytest.mark.parametrize("over", [{}, FREE, {"loops": 2}], ids=["lockstep", "free", "loops"])
+@pytest.mark.parametrize("over", [LONG({}), FREE, LONG({"loops": 2})], ids=["lockstep", "free", "loops"])
 def test_up_makes_a_plant_in_execute_alone(here, over):
     config = write_config(here, {**plant(), **over})
     with up(config, short=("-q",)) as running:
@@ -161,7 +163,7 @@ gymnasium.register("Simulator-v0", Simulator, max_episode_steps=3)
 """
 
 
-@pytest.mark.parametrize("options", [("--set", "loops=2"), ("--trials", "2", "--workers", "1")])
+@pytest.mark.parametrize("options", [("--set", "loops=2"), LONG(("--trials", "2", "--workers", "1"))])
 def test_a_simulator_that_exists_once_per_process_serves_one_loop_after_the_other(here, options):
     (here / "simulator.py").write_text(ONE_PER_PROCESS)
     config = write_config(here, plant(system={"id": "simulator:Simulator-v0"}))

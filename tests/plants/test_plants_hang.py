@@ -47,6 +47,7 @@ def test_a_run_ends_where_a_step_hangs_once_too_often_and_resume_goes_on(here, n
     assert resets(here)[-1] == EPISODES
 
 
+@pytest.mark.long
 def test_an_execute_that_is_served_by_hand_ends_itself_where_its_step_hangs(here):
     config = write_config(here, hangs(1, 1))
     where = endpoint(here)

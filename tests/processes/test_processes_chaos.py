@@ -37,8 +37,8 @@ def undisturbed(config, result, out="up"):
 
 def test_a_run_outlives_kills_of_all_roles_and_a_freeze(here):
     # The run goes on long after the last moment, for a blow may come up to a second after it.
-    config = example(here, "gridworld_goals", "episodes=1100", "system.options.switch_at=[101,301]")
-    plan = blows(seed=7, total=600, kills=6, freezes=1, must=("knowledge", "execute", "plan"))
+    config = example(here, "gridworld_goals", "episodes=850", "system.options.switch_at=[101,301]")
+    plan = blows(seed=7, total=400, kills=4, freezes=1, must=("knowledge", "execute", "plan"))
     result, done, _ = survive(config, plan, "--snapshot-every", "37")
     assert len(done) == len(plan)
     undisturbed(config, result)

@@ -18,7 +18,9 @@ MORE = 150
     [
         (Outbox, "_transmit"),  # what is sent waits in a queue that is full, as over a link that is cut
         pytest.param(Member, "beat", marks=pytest.mark.long),
-        (Member, "_keep_up"),  # a session that hears nothing is given up for another one, which takes its time
+        pytest.param(
+            Member, "_keep_up", marks=pytest.mark.long
+        ),  # a session that hears nothing is given up for another one, which takes its time
         pytest.param(Member, "_acknowledged", marks=pytest.mark.long),
     ],
 )

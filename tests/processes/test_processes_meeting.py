@@ -209,6 +209,7 @@ def test_the_first_difference_told_is_none_that_is_only_for_people(here):
                 assert difference in stranger.end(2, 60.0)
 
 
+@pytest.mark.long
 def test_a_knowledge_that_cannot_listen_leaves_no_folder(here):
     config = str(gridworld(here, 100))
     with socket.socket() as other:

@@ -64,7 +64,7 @@ def refused(here, name):
     ("name", "says"),
     [
         pytest.param("Exits", "SystemExit was raised: 5", marks=pytest.mark.long),
-        ("Interrupts", "KeyboardInterrupt"),
+        pytest.param("Interrupts", "KeyboardInterrupt", marks=pytest.mark.long),
         ("InTheWay", "SystemExit: I am a script"),
     ],
 )

@@ -88,7 +88,7 @@ def test_workers_leave_when_their_parent_is_killed(tmp_path: Path) -> None:
         wait_until_gone(children)
 
 
-@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_ctrl_c_ends_with_130_names_the_folder_and_how_to_go_on_and_keeps_what_is_finished(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], times: int
 ) -> None:
