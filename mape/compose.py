@@ -313,11 +313,18 @@ def specialise(dispatcher: Any, arguments: tuple[Any, ...], what: str) -> Rule:
 
 _special: dict[tuple[Any, Any], Rule] = {}
 
+_NUMBERS = frozenset({bool, int, float})
+"""Of these, of which a rule has dozens, the type is all."""
+
 
 def _kind(argument: Any) -> Any:
     """Return what fixes an argument's type in compiled code; Numba's own answer takes longer than many episodes."""
     if isinstance(argument, tuple):
-        return (type(argument), *map(_kind, argument))
+        kinds = map(type, argument)
+        return (
+            type(argument),
+            *[kind if kind in _NUMBERS else _kind(one) for one, kind in zip(argument, kinds, strict=True)],
+        )
     if isinstance(argument, np.ndarray):
         flags = argument.flags
         return argument.dtype, argument.ndim, flags.c_contiguous, flags.f_contiguous, flags.writeable, flags.aligned
