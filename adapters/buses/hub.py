@@ -23,7 +23,7 @@ from adapters.buses.messages import (
     Table,
 )
 from adapters.buses.own_keys import OwnKeys
-from adapters.buses.pace import PACE, ROOM, Pace, Room
+from adapters.buses.pace import PACE, ROOM, Counted, Pace, Room
 from adapters.buses.presence import Presence
 from adapters.buses.wire import (
     ORDERED,
@@ -98,6 +98,7 @@ class KnowledgeHub:
             ledger.store.set_facts(seal=self._seal)
             ledger.commit()
         self._asked: SimpleQueue[tuple[str, Any] | None] = SimpleQueue()
+        self._streams: dict[tuple[str, int], tuple[zenoh.Session, zenoh.KeyExpr]] = {}
         self.presence = Presence(ledger, wire.system, config or {})
         self.answers = Answers(
             ledger,
@@ -265,26 +266,30 @@ class KnowledgeHub:
         with suppress(zenoh.ZError), answer.query:  # who asked may have gone; the others have not
             if answer.published is not None:
                 role, loop, record = answer.published
-                assert self._session is not None
+                session, stream = self._stream(role, loop)
                 # By no declared publisher: for a moment that would know of no taker, and send nothing.
-                self._session.put(
-                    self.wire.stream(role, loop), record, attachment=self._seal,
-                    encoding=zenoh.Encoding.APPLICATION_JSON, **ORDERED,
-                )  # fmt: skip
+                session.put(stream, record, attachment=self._seal, encoding=zenoh.Encoding.APPLICATION_JSON, **ORDERED)
             # A question may name any system: what is said stands under this one's key.
             _, _, rest = str(answer.query.key_expr).split("/", 2)
             answer.query.reply(f"mape/{self.wire.system}/{rest}", answer.payload)
 
+    def _stream(self, role: str, loop: int) -> tuple[zenoh.Session, zenoh.KeyExpr]:
+        """Return the session, and its declared key of a stream: who may read it is looked up once for all records."""
+        found = self._streams.get((role, loop))
+        if found is None or found[0] is not self._session:  # which is another one after new keys
+            session = self._session
+            assert session is not None
+            found = session, session.declare_keyexpr(self.wire.stream(role, loop))
+            self._streams[role, loop] = found
+        return found
+
     def _room(self, kind: str) -> Room:
-        return Room(
-            lambda what: self._asked.put((kind, what)),
-            lambda what: _leave_unanswered((kind, what)),
-            ROOM * self.ledger.units,
-        )
+        return Room(self._asked, kind, lambda what: _leave_unanswered((kind, what)), ROOM * self.ledger.units)
 
     def _hear(self, kind: str, what: Any, answers: list[Answer | Relay]) -> None:
-        if kind in self._rooms:
-            self._rooms[kind].heard(what)
+        if isinstance(what, Counted):
+            room, what = what
+            room.heard(what)
         try:
             if kind == "beat":
                 self.presence.beats(what)
@@ -400,7 +405,7 @@ def _leave_unanswered(asked: tuple[str, Any] | None) -> None:
     if asked is None:
         return
     kind, what = asked
-    query = what[0] if kind == "table" else what
+    query = what[0] if kind == "table" else what.what if isinstance(what, Counted) else what
     if isinstance(query, zenoh.Query):
         with query:
             pass

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 from adapters.roles import ROLES
 
@@ -21,6 +21,9 @@ WAITS = 5.0
 
 ROOM = 1024
 """Records of one role, for each loop, that wait to be appended at most; of signs of life as many."""
+
+FEW = 32
+"""Messages that may wait before each role's are counted."""
 
 _BESIDE = ("status", "swap", "join")  # no pass rests on these
 
@@ -93,34 +96,54 @@ class Pace:
 class Room:
     """Lets each role have so much waiting, so that none keeps the others waiting behind what it sends.
 
+    Whose a message is, is looked at only where much waits: that takes Knowledge longer than to append a record.
+
     Parameters
     ----------
-    take
-        Told each message that there is room for.
+    queue
+        Where what there is room for is put, as (kind, message).
+    kind
+        Which messages these are.
     leave
-        Told each other; who sent it sends it again.
+        Told each message that there is no room for; who sent it sends it again.
     most
-        Messages of a role that wait at most, until `heard` is told of them.
+        Messages of a role that wait at most, beside the `FEW` of whomever.
     """
 
-    def __init__(self, take: Callable[[Any], object], leave: Callable[[Any], object], most: int = ROOM) -> None:
-        self._take, self._leave, self._most = take, leave, most
+    def __init__(
+        self, queue: SimpleQueue[Any], kind: str, leave: Callable[[Any], object], most: int = ROOM, few: int = FEW
+    ) -> None:
+        self._put, self._waits, self._leave = queue.put, queue.qsize, leave
+        self._kind, self._most, self._few = kind, most, few
         self._waiting = dict.fromkeys((*ROLES, ""), 0)
         self._lock = threading.Lock()
 
     def hear(self, what: Any) -> None:
         """Take a query or sample whose key ends with its role; called on Zenoh's threads."""
+        if self._waits() < self._few:
+            self._put((self._kind, what))
+            return
         role = self._role(what)
         with self._lock:
             there_is = self._waiting[role] < self._most
             self._waiting[role] += there_is
-        (self._take if there_is else self._leave)(what)
+        if there_is:
+            self._put((self._kind, Counted(self, what)))
+        else:
+            self._leave(what)
 
     def heard(self, what: Any) -> None:
-        """Make room again: what was taken is dealt with."""
+        """Make room again: what was counted is dealt with."""
         with self._lock:
             self._waiting[self._role(what)] -= 1
 
     def _role(self, what: Any) -> str:
         role = str(what.key_expr).rpartition("/")[2]
         return role if role in self._waiting else ""
+
+
+class Counted(NamedTuple):
+    """A message that takes room until it is dealt with."""
+
+    room: Room
+    what: Any

@@ -124,8 +124,7 @@ class Ledger:
             seen, symptom, request, plan = (log.last(kind) for kind in STAGES)
             return seen, symptom, request, plan
         done, begun = log.passes, len(log.open_records)
-        passed = [done + (stage < begun) for stage in range(3)]
-        return passed[0], passed[1], passed[2], done if log.started else -1
+        return done + (begun > 0), done + (begun > 1), done + (begun > 2), done if log.started else -1
 
     # Records.
 
