@@ -55,7 +55,7 @@ def remove_orphan(folder: Path, within: float = 0.0) -> None:
     """
     until = time.monotonic() + within
     while not _removed(folder) and time.monotonic() < until:
-        time.sleep(LOOK_EVERY)
+        time.sleep(LOOK_EVERY)  # to wait in `flock` itself would have no end where the owner lives on
 
 
 def _removed(folder: Path) -> bool:

@@ -101,9 +101,8 @@ def import_for(named: str, module_name: str) -> ModuleType:
     ConfigError
         There is no such module, it lacks another one, or it raises.
     """
-    if module_name in sys.modules:  # as it is for all trials but the first
-        return sys.modules[module_name]
-    look_here()
+    if module_name not in sys.modules:  # as it is for all trials but the first
+        look_here()
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:

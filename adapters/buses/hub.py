@@ -98,7 +98,6 @@ class KnowledgeHub:
             ledger.store.set_facts(seal=self._seal)
             ledger.commit()
         self._asked: SimpleQueue[tuple[str, Any] | None] = SimpleQueue()
-        self._streams: dict[tuple[str, int], tuple[zenoh.Session, zenoh.KeyExpr]] = {}
         self.presence = Presence(ledger, wire.system, config or {})
         self.answers = Answers(
             ledger,
@@ -266,22 +265,15 @@ class KnowledgeHub:
         with suppress(zenoh.ZError), answer.query:  # who asked may have gone; the others have not
             if answer.published is not None:
                 role, loop, record = answer.published
-                session, stream = self._stream(role, loop)
+                assert self._session is not None
                 # By no declared publisher: for a moment that would know of no taker, and send nothing.
-                session.put(stream, record, attachment=self._seal, encoding=zenoh.Encoding.APPLICATION_JSON, **ORDERED)
+                self._session.put(
+                    self.wire.stream(role, loop), record, attachment=self._seal,
+                    encoding=zenoh.Encoding.APPLICATION_JSON, **ORDERED,
+                )  # fmt: skip
             # A question may name any system: what is said stands under this one's key.
             _, _, rest = str(answer.query.key_expr).split("/", 2)
             answer.query.reply(f"mape/{self.wire.system}/{rest}", answer.payload)
-
-    def _stream(self, role: str, loop: int) -> tuple[zenoh.Session, zenoh.KeyExpr]:
-        """Return the session, and its declared key of a stream: who may read it is looked up once for all records."""
-        found = self._streams.get((role, loop))
-        if found is None or found[0] is not self._session:  # which is another one after new keys
-            session = self._session
-            assert session is not None
-            found = session, session.declare_keyexpr(self.wire.stream(role, loop))
-            self._streams[role, loop] = found
-        return found
 
     def _room(self, kind: str) -> Room:
         return Room(self._asked, kind, lambda what: _leave_unanswered((kind, what)), ROOM * self.ledger.units)
@@ -405,7 +397,9 @@ def _leave_unanswered(asked: tuple[str, Any] | None) -> None:
     if asked is None:
         return
     kind, what = asked
-    query = what[0] if kind == "table" else what.what if isinstance(what, Counted) else what
+    if isinstance(what, Counted):
+        what = what.what
+    query = what[0] if kind == "table" else what
     if isinstance(query, zenoh.Query):
         with query:
             pass

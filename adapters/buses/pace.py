@@ -96,7 +96,7 @@ class Pace:
 class Room:
     """Lets each role have so much waiting, so that none keeps the others waiting behind what it sends.
 
-    Whose a message is, is looked at only where much waits: that takes Knowledge longer than to append a record.
+    Whose a message is, is looked at only where much waits: it costs a call into Zenoh and a lock, twice a record.
 
     Parameters
     ----------
@@ -107,7 +107,9 @@ class Room:
     leave
         Told each message that there is no room for; who sent it sends it again.
     most
-        Messages of a role that wait at most, beside the `FEW` of whomever.
+        Messages of a role that wait at most, beside the few of whomever.
+    few
+        Messages in `queue` up to which nobody's are counted.
     """
 
     def __init__(

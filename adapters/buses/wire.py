@@ -294,6 +294,7 @@ class Wire:
             As `join`; of a slow network after the patience, of this machine at once.
         """
         patience, until = RoundTrip(self.patience), time.monotonic()
+        # Who proves itself by keys may take its time here too, so that a role tries for longer; a person is told.
         if not endpoints.on_this_machine(endpoints.reached(self.endpoint, self.tls is not None)):
             until += max(least, self.patience)
         while True:

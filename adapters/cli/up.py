@@ -152,8 +152,12 @@ def _drive(chosen: argparse.Namespace, config: Config, label: str, wire: Wire, f
     if not chosen.quiet:
         print(f"five processes meet on {wire.endpoint}; the log is {folder.path / LOG_NAME}", file=sys.stderr)
     screen = Screen(chosen, config)
-    tries = {"hang_after": chosen.hang_after, "retries": config.system.retries}
-    with Supervisor(wire, commands, logs, tell=screen.tell, **tries) as supervisor, screen:
+    with (
+        Supervisor(
+            wire, commands, logs, hang_after=chosen.hang_after, retries=config.system.retries, tell=screen.tell
+        ) as supervisor,
+        screen,
+    ):
         supervisor.watch(screen.show)
         restarts = {role: child.restarts for role, child in supervisor.children.items() if child.restarts}
     if restarts:

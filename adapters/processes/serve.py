@@ -103,7 +103,8 @@ def leash(folder: Path | None = None) -> threading.Event:
         if folder is not None:
             remove_orphan(folder, ENDS_WITHIN)
         os.kill(os.getpid(), signal.SIGTERM)
-        # A part may keep to itself what ends it. Nobody else would say the last word now.
+        # A part may keep to itself what ends it. Nobody else would say the last word now; where all goes well, this
+        # thread ends with its process in the middle of its sleep.
         time.sleep(ENDS_WITHIN)
         os.kill(os.getpid(), signal.SIGKILL)
 

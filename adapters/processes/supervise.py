@@ -260,8 +260,7 @@ class Supervisor:
         if code == SYSTEM_FAILED:
             raise Failed(_last_sentence(child))
         if child.role != KNOWLEDGE:
-            self._asked_at = -math.inf
-            self._ask()  # how far it came, Knowledge may have been told since it was asked last
+            self._ask(at_once=True)  # how far it came, Knowledge may have been told since it was asked last
         now = time.monotonic()
         if code == HUNG:
             self.tell(f"{child.role} (process {child.pid}) ended itself: {_last_sentence(child)} It is started again.")
@@ -345,9 +344,9 @@ class Supervisor:
                 return f"{role}: {_last_sentence(child)}"
         return ""
 
-    def _ask(self) -> None:
+    def _ask(self, at_once: bool = False) -> None:
         now = self._now()
-        if self._heard_at and now - self._asked_at < STATUS_EVERY:
+        if self._heard_at and not at_once and now - self._asked_at < STATUS_EVERY:
             return
         self._asked_at = now
         found: list[Status] = []

@@ -34,7 +34,7 @@ READER_LEAVES_WITHIN = 10.0
 LOOK_EVERY = 16
 """Commits from one look at the size of the write-ahead log to the next."""
 
-FLUSH_EVERY = 4000
+FLUSH_EVERY = 1000
 """Commits from one look to the next whether all before them are flushed."""
 
 

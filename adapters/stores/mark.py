@@ -8,7 +8,6 @@ mark is refused; one that is ahead, by what was committed and never acknowledged
 from __future__ import annotations
 
 import hashlib
-import mmap
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -93,9 +92,7 @@ class MarkFile:
         self._file = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, private.FILE)
         try:
             os.fchmod(self._file, private.FILE)
-            os.pwrite(self._file, _text(mark), 0)  # which tells of a full disk; what is mapped could not
-            # Mapped: a call of the system at each commit would let go of the interpreter, and wait to have it back.
-            self._seen = mmap.mmap(self._file, len(_text(mark)))
+            self.write(mark)
             os.fsync(self._file)
             os.replace(part, path)
             folder = os.open(path.parent, os.O_RDONLY)
@@ -111,12 +108,11 @@ class MarkFile:
 
     def write(self, mark: Mark) -> None:
         """Say something else; what is written has one length, and is written over what was there."""
-        self._seen[:] = _text(mark)
+        os.pwrite(self._file, _text(mark), 0)
         self.mark = mark
 
     def close(self) -> None:
         """Leave the file."""
-        self._seen.close()
         os.close(self._file)
 
 

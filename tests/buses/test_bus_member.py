@@ -94,14 +94,10 @@ class Unreliable:
         site.hub._session = self
 
     def put(self, key, payload, **options):
-        concerned = str(key) == self.key
-        changed = self.how(self.count, payload) if concerned else [payload]
-        self.count += concerned
+        changed = self.how(self.count, payload) if key == self.key else [payload]
+        self.count += key == self.key
         for one in changed:
             self.session.put(key, one, **options)
-
-    def declare_keyexpr(self, key):
-        return self.session.declare_keyexpr(key)
 
     def close(self):
         self.session.close()

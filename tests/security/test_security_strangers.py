@@ -31,7 +31,7 @@ from adapters.processes import roles, execute_role
 from adapters.systems import make_system
 from mape import load
 
-endpoint, mark, config, home = sys.argv[1:]
+endpoint, mark, config, home, parts = sys.argv[1:]
 serve._keep_standard_output = lambda most: None  # it starts the interpreter once more
 os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp()
 tokens.make("tcp/127.0.0.1:9", security.CLIENTS)
@@ -44,7 +44,8 @@ own = tokens.make(endpoint, security.CLIENTS)  # a token, and not the run's
 evil = '{{name = "subprocess:Popen", args = ["touch", "' + mark + '"]}}'
 at = ["--connect", endpoint]
 codes = [main.main(["status", *at]), main.main(["status", *at, "--token", str(own)])]
-codes.append(main.main(["swap", "monitor", evil, *at]))
+for part in parts.split():
+    codes.append(main.main(["swap", part, evil, *at]))
 codes.append(main.main(["serve", config, "--role", "knowledge", "--listen", endpoint]))
 
 quiet = {{"enabled": False}}
@@ -63,9 +64,9 @@ print(json.dumps([codes, opened]))
 """
 
 
-def act_as_a_stranger(endpoint, mark, config, home):
+def act_as_a_stranger(endpoint, mark, config, home, parts):
     program = textwrap.dedent(STRANGER)
-    arguments = [endpoint, str(mark), str(config), str(home)]
+    arguments = [endpoint, str(mark), str(config), str(home), parts]
     done = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1]), done.stderr
@@ -93,11 +94,19 @@ def free_port():
         return probe.getsockname()[1]
 
 
+LOOPBACK = "tcp/127.0.0.1:PORT"
 OTHERS = ["tcp/0.0.0.0:PORT", "unixsock-stream/OUTSIDE/k.sock", "default"]
 
 
-@pytest.mark.parametrize("at", ["tcp/127.0.0.1:PORT", *(pytest.param(at, marks=pytest.mark.long) for at in OTHERS)])
-def test_another_user_reads_constructs_and_stops_nothing(here, outside, config, at):
+# Each part that is asked for is some seconds of waiting for an answer that does not come.
+@pytest.mark.parametrize(
+    ("at", "parts"),
+    [
+        (LOOPBACK, "monitor"),
+        *(pytest.param(at, "monitor analyze plan learner", marks=pytest.mark.long) for at in (LOOPBACK, *OTHERS)),
+    ],
+)
+def test_another_user_reads_constructs_and_stops_nothing(here, outside, config, at, parts):
     where = at.replace("PORT", str(free_port())).replace("OUTSIDE", str(outside))
     home = outside / "home"
     home.mkdir()
@@ -112,7 +121,7 @@ def test_another_user_reads_constructs_and_stops_nothing(here, outside, config, 
         words = until(lambda: [w for w in running.said.split() if w.startswith(("tcp/", "unixsock"))], "a place")
         met = words[0].rstrip(";")
         reached = met.replace("0.0.0.0", "127.0.0.1")
-        (codes, opened), said = act_as_a_stranger(reached, outside / "mark", outside / "config.json", home)
+        (codes, opened), said = act_as_a_stranger(reached, outside / "mark", outside / "config.json", home, parts)
         assert opened == 0
         assert all(code in (1, 2) for code in codes), (codes, said)
         assert not (outside / "mark").exists()
