@@ -1,9 +1,13 @@
 """What is asked of a plant's diary."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 EPISODES = 12
+LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 
 
 def plant(episodes: int = EPISODES, name: str = "Pump", system: Any = (), **over: Any) -> dict[str, Any]:

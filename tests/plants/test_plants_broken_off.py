@@ -1,19 +1,17 @@
 """An episode that a plant breaks off is begun again as often as the config says, under every command, and is told."""
 
-import functools
 import json
 import os
 import signal
 
 import pytest
-from diaries import EPISODES, diary, lives, one_by_one, plant, resets
+from diaries import EPISODES, LONG, diary, lives, one_by_one, plant, resets
 from real_processes import events, last, rows, until, up, write_config
 from real_runs import run
 
 pytestmark = pytest.mark.timeout(120)
 
 SHORT = ("--no-figures", "-q")
-LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 AT = 7
 """The episode that is broken off."""
 

@@ -1,19 +1,17 @@
 """Looking at a plant does not touch it: its diary over every command holds one reset for each logged episode."""
 
-import functools
 import json
 import subprocess
 import sys
 
 import pytest
-from diaries import EPISODES, diary, lives, one_by_one, plant, resets
+from diaries import EPISODES, LONG, diary, lives, one_by_one, plant, resets
 from real_processes import end_all, endpoint, five, up, write_config
 from real_runs import MAPEK, run
 
 pytestmark = pytest.mark.timeout(120)
 
 SHORT = ("--no-figures", "-q")
-LONG = functools.partial(pytest.param, marks=pytest.mark.long)
 FREE = {"execute": {"mode": "free", "rate": 200.0}}
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from adapters.stores import Snapshot, Store, Swap
 from adapters.stores import ledger as ledger_module
+from adapters.stores.begun import begins, begun, go_on
 from adapters.stores.ledger import Conflict, Ledger, differences
 from knowledge import STAGES, Ack, MalformedRecord, QTable, to_json
 from mape.errors import BusError, ResultsError
@@ -416,3 +417,13 @@ def test_a_swap_of_a_loop_that_is_not_there_is_refused(ledger):
 
 def test_differences_name_fields_that_only_one_has():
     assert differences('{"a": 1}', '{"b": 2}') == ": a is 1 there, and null here; b is null there, and 2 here"
+
+
+def test_each_episode_that_was_begun_and_not_heard_of_is_told_when_a_run_goes_on(ledger):
+    begins(ledger.store, 0, 3)  # of one that runs freely: 1 and 2 were driven, and their Observations lost
+    for _ in range(2):
+        go_on(ledger)
+        assert [(event.kind, event.pass_no) for event in ledger.store.events()] == [
+            ("aborted", 3), ("aborted", 2), ("aborted", 1)
+        ]  # fmt: skip
+    assert begun(ledger.store, 0) == 0
